@@ -126,9 +126,8 @@ class Alignment:
     recording: Recording  # recording as it was
     settings: AlignmentSettings  # settings of the estimate
     parameters: tuple[Parameter, ...]  # estimated parameters in the order of `UNITS`
-    transforms: tuple[
-        Mapping[str, Any], ...
-    ]  # configurations of the transforms that would correct it, in the order of their application
+    # configurations of the transforms that would correct it, in the order of their application
+    transforms: tuple[Mapping[str, Any], ...]
     residuals: tuple[Residual, ...] = ()  # residuals of the channels that were compared
     # cross-correlation of sensor and reference; None where there is no reference
     correlation: Correlation | None = None
@@ -277,13 +276,11 @@ def _residuals(fit: ImuFit, corrected: Signals) -> tuple[Residual, ...]:
     untilted = after.measured - after({**NOTHING, **tilt})[0]
     residuals = []
     for row, channel in enumerate(fit.signals.channels):
-        rms_untilted = (
-            rms(untilted[row]) if any(tilt.values()) and channel != "yaw_rate" else math.nan
-        )
+        is_tilted = any(tilt.values()) and channel != "yaw_rate"
         sizes = {
             "before": rms(error_before[row]),
             "after": rms(error_after[row]),
-            "rest": rms_untilted,
+            "rest": rms(untilted[row]) if is_tilted else math.nan,
         }
         residuals.append(Residual(channel, UNITS[f"offset_{channel}"], sizes))
     return tuple(residuals)
@@ -346,13 +343,11 @@ def _imu_notes(
             "and pitch."
         )
     if settings.tilt > 0:
-        gains = (
-            f"{_percent(values['tilt_gain_x'])} in ax and {_percent(values['tilt_gain_y'])} in ay"
-        )
         notes.append(
-            f"Gain error relative to the reference's acceleration: {gains}, from gravity in the "
-            "pitching and rolling body (1 % is 0.57° at 1 g) or a scale error. No transform "
-            "corrects it."
+            "Gain error relative to the reference's acceleration: "
+            f"{_percent(values['tilt_gain_x'])} in ax and {_percent(values['tilt_gain_y'])} in "
+            "ay, from gravity in the pitching and rolling body (1 % is 0.57° at 1 g) or a scale "
+            "error. No transform corrects it."
         )
     return notes
 
@@ -409,10 +404,10 @@ def _align_steering(
     seconds = float(calm.sum()) * smoothing.step / recording.rate_hz
     min_seconds = MIN_BLOCKS * MIN_BLOCK_SECONDS
     if seconds < min_seconds:
-        calm_is = f"vx ≥ {settings.min_speed:g} m/s and |ay| ≤ {settings.max_ay:g} m/s²"
         raise DataError(
-            f"recording '{recording.id}': only {seconds:.3g} s with {calm_is}; "
-            f"the steering ratio needs at least {min_seconds:g} s"
+            f"recording '{recording.id}': only {seconds:.3g} s with vx ≥ {settings.min_speed:g} "
+            f"m/s and |ay| ≤ {settings.max_ay:g} m/s²; the steering ratio needs at least "
+            f"{min_seconds:g} s"
         )
     columns = np.stack([low(angle), np.ones(len(calm)), low(recording["ay"]), low(angle, 1)])[
         :, calm
@@ -452,12 +447,10 @@ def _align_steering(
     ]
     by_scatter = _parameter(names[0], ratio, float(scatter[0]), 0.0, blocks - 1)
     if by_scatter.may_be_zero:
-        problem = (
-            f"'{source}' does not follow the curvature of the path (ratio {ratio:.3g} ± "
-            f"{scatter[0]:.2g})"
-        )
         raise DataError(
-            f"recording '{recording.id}': {problem}; check its sign, or use a drive with slow turns"
+            f"recording '{recording.id}': '{source}' does not follow the curvature of the path "
+            f"(ratio {ratio:.3g} ± {scatter[0]:.2g}); check its sign, or use a drive with slow "
+            "turns"
         )
     transform = {
         "name": "steering_ratio",
@@ -465,12 +458,11 @@ def _align_steering(
         "offset": _rounded(offset),
         "channel": source,
     }
-    ratio_of = (
+    note = (
         f"Steering ratio of '{source}' to atan(wheelbase·{yaw_rate}/vx), wheelbase "
-        f"{settings.wheelbase:g} m"
+        f"{settings.wheelbase:g} m, from {seconds:.0f} s (vx ≥ {settings.min_speed:g} m/s, |ay| ≤ "
+        f"{settings.max_ay:g} m/s²); residual {rms(error):.2g} rad RMS."
     )
-    limits = f"vx ≥ {settings.min_speed:g} m/s, |ay| ≤ {settings.max_ay:g} m/s²"
-    note = f"{ratio_of}, from {seconds:.0f} s ({limits}); residual {rms(error):.2g} rad RMS."
     return estimates, transform, note
 
 

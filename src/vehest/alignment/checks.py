@@ -276,16 +276,15 @@ def _kinematics(motion: Motion) -> Iterator[Finding]:
     if predicted.std() == 0.0 or derived.std() < MIN_SLIDING:
         return
     correlation = float(np.corrcoef(predicted, derived)[0, 1])
-    band_hz = f"{KINEMATIC_BAND_HZ[0]:g} to {KINEMATIC_BAND_HZ[1]:g} Hz"
-    figures = f"d(vy_ref)/dt vs. ay - vx·yaw_rate: correlation {correlation:.2f} ({band_hz})"
+    low_hz, high_hz = KINEMATIC_BAND_HZ
+    figures = (
+        f"d(vy_ref)/dt vs. ay - vx·yaw_rate: correlation {correlation:.2f} ({low_hz:g} to "
+        f"{high_hz:g} Hz)"
+    )
     if correlation >= MIN_SIGN_CORRELATION:
         bias = float((motion.sliding - expected)[motion.moving].mean())
-        yield Finding(
-            "note",
-            "kinematics",
-            "vy_ref",
-            f"{figures}, mean difference {bias:.3f} m/s²",
-        )
+        message = f"{figures}, mean difference {bias:.3f} m/s²"
+        yield Finding("note", "kinematics", "vy_ref", message)
     else:
         message = (
             f"{figures}, expected at least {MIN_SIGN_CORRELATION:g}: "
@@ -338,12 +337,8 @@ def _not_measured(recording: Recording, _: BoolArray) -> Iterator[Finding]:
     for name in sorted(recording.gappy):
         missing = int(np.isnan(recording[name]).sum())
         if missing:
-            yield Finding(
-                "note",
-                "nan",
-                name,
-                f"{100 * missing / len(recording):.1f} % of the samples are missing",
-            )
+            message = f"{100 * missing / len(recording):.1f} % of the samples are missing"
+            yield Finding("note", "nan", name, message)
 
 
 def _stuck(recording: Recording, moving: BoolArray) -> Iterator[Finding]:
@@ -352,44 +347,41 @@ def _stuck(recording: Recording, moving: BoolArray) -> Iterator[Finding]:
     """
     moved = np.concatenate([[0], np.cumsum(moving)])
     for name, samples in recording.channels.items():
-        measured = np.flatnonzero(~np.isnan(samples))
+        rows = np.flatnonzero(~np.isnan(samples))
+        measured = samples[rows]
         unit = CHANNELS[name].unit
         rests = CHANNELS[name].rests
-        if rests and not samples[measured].any():
+        if rests and not measured.any():
             continue
-        if len(measured) > 1 and (samples[measured] == samples[measured[0]]).all():
-            yield Finding(
-                "warning",
-                "stuck",
-                name,
-                f"constant at {samples[measured[0]]:.6g} {unit} throughout; "
-                "check the sensor, or leave the channel out",
+        runs = equal_runs(measured)
+        if len(measured) > 1 and len(runs) == 1:
+            message = (
+                f"constant at {measured[0]:.6g} {unit} throughout; "
+                "check the sensor, or leave the channel out"
             )
+            yield Finding("warning", "stuck", name, message)
             continue
-        runs = equal_runs(samples[measured])
         runs = runs[
             (runs[:, 1] - runs[:, 0] >= MIN_STUCK_SAMPLES)
-            & ~(rests & (samples[measured[runs[:, 0]]] == 0.0))
-            & ~_goes_on_by_one_step(samples[measured], runs)
+            & ~(rests & (measured[runs[:, 0]] == 0.0))
+            & ~_goes_on_by_one_step(measured, runs)
         ]
-        begins = measured[runs[:, 0]]
-        ends = measured[runs[:, 1] - 1] + 1
+        begins = rows[runs[:, 0]]
+        ends = rows[runs[:, 1] - 1] + 1
         moving_samples = moved[ends] - moved[begins]
-        if len(runs) and moving_samples.max() >= STUCK_SECONDS * recording.rate_hz:
+        is_stuck = moving_samples >= STUCK_SECONDS * recording.rate_hz
+        if is_stuck.any():
             longest = int(np.argmax(moving_samples))
             first = int(begins[longest] + np.argmax(moving[begins[longest] : ends[longest]]))
-            seconds = moving_samples[longest] / recording.rate_hz
-            time = recording.time[first]
-            n_others = int((moving_samples >= STUCK_SECONDS * recording.rate_hz).sum()) - 1
+            n_others = int(is_stuck.sum()) - 1
             others = f", and in {number_of(n_others, 'other segment')}" if n_others else ""
-            yield Finding(
-                "warning",
-                "stuck",
-                name,
-                f"constant at {samples[first]:.6g} {unit} for {seconds:.3g} s from t = {time:.12g} "
-                f"s while the car moves{others}; check the sensor, or exclude "
-                f"{'these ranges' if others else 'this range'}",
+            message = (
+                f"constant at {samples[first]:.6g} {unit} for "
+                f"{moving_samples[longest] / recording.rate_hz:.3g} s from t = "
+                f"{recording.time[first]:.12g} s while the car moves{others}; check the sensor, or "
+                f"exclude {'these ranges' if others else 'this range'}"
             )
+            yield Finding("warning", "stuck", name, message)
 
 
 def _goes_on_by_one_step(samples: FloatArray, runs: NDArray[np.int64]) -> BoolArray:
@@ -410,9 +402,10 @@ def _saturated(recording: Recording, moving: BoolArray) -> Iterator[Finding]:
     """
     for name, samples in recording.channels.items():
         measured = samples[np.isfinite(samples) & moving]
-        lowest, highest = (
-            (measured.min(), measured.max()) if len(measured) >= MIN_SAMPLES else (0.0, 0.0)
-        )
+        if len(measured) < MIN_SAMPLES:
+            continue
+        lowest = measured.min()
+        highest = measured.max()
         between = measured[(measured > lowest) & (measured < highest)]
         if not len(between):
             continue
@@ -422,18 +415,15 @@ def _saturated(recording: Recording, moving: BoolArray) -> Iterator[Finding]:
         ):
             at = measured == extreme
             number = int(at.sum())
-            min_number = SATURATED_EXCESS * np.count_nonzero(measured == beside)
-            is_extreme = abs(extreme) >= 0.1 * max(abs(lowest), abs(highest))
             if (
-                is_extreme
+                abs(extreme) >= 0.1 * max(abs(lowest), abs(highest))
                 and number > SATURATED_FRACTION * len(measured)
-                and number >= min_number
+                and number >= SATURATED_EXCESS * np.count_nonzero(measured == beside)
                 and len(true_runs(at)) > 1
             ):
-                share = f"{100 * number / len(measured):.2g} % of the samples"
-                value = f"{extreme:.6g} {CHANNELS[name].unit}"
                 message = (
-                    f"saturated: {share} are at the {side} value, {value}; "
+                    f"saturated: {100 * number / len(measured):.2g} % of the samples are at the "
+                    f"{side} value, {extreme:.6g} {CHANNELS[name].unit}; "
                     "check the range of the sensor, or exclude these samples"
                 )
                 yield Finding("warning", "saturated", name, message)
@@ -453,12 +443,12 @@ def _spikes(recording: Recording, _: BoolArray) -> Iterator[Finding]:
         counts = (samples >= CHANNELS[name].low) & (samples <= CHANNELS[name].high)
         if name == "sideslip_ref":
             counts &= speed > STANDSTILL_SPEED
-        measured = samples[np.isfinite(samples)]
+        rows = np.flatnonzero(np.isfinite(samples))
+        measured = samples[rows]
         if len(measured) < MIN_SAMPLES:
             continue
         low, high = np.quantile(measured, USUAL_QUANTILES)
         excess = SPIKE_EXCESS * (high - low)
-        rows = np.flatnonzero(np.isfinite(samples))
         steps = np.abs(np.diff(measured))
         jump = max(excess, SPIKE_STEP * float(np.quantile(steps, USUAL_STEP_QUANTILE)))
         is_jump = np.pad(steps > jump, 1)
@@ -476,11 +466,11 @@ def _spikes(recording: Recording, _: BoolArray) -> Iterator[Finding]:
             and (is_jump[[begin, end]].all() or is_far[begin:end].all())
             and counts[rows[begin:end]].all()
         ]
+        unit = CHANNELS[name].unit
         if spikes:
             sizes = np.abs(samples)
             begin, end = max(spikes, key=lambda run: float(np.nanmax(sizes[slice(*run)])))
             at = begin + int(np.nanargmax(sizes[begin:end]))
-            unit = CHANNELS[name].unit
             message = (
                 f"{number_of(len(spikes), 'spike')} of at most {SPIKE_SECONDS:g} s far outside the "
                 f"usual range ({low:.4g} to {high:.4g} {unit}), the largest {samples[at]:.4g} "
@@ -495,7 +485,6 @@ def _spikes(recording: Recording, _: BoolArray) -> Iterator[Finding]:
         ]
         if jumps:
             begin, end = max(jumps, key=lambda run: run[1] - run[0])
-            unit = CHANNELS[name].unit
             message = (
                 f"jumps away and back {number_of(len(jumps), 'time')} within {JUMP_SECONDS:g} s, "
                 f"the longest to {samples[begin]:.4g} {unit} for "
@@ -564,10 +553,10 @@ def _steering_offset(recording: Recording, _: BoolArray) -> Iterator[Finding]:
         if abs(offset) >= max(max_offset, 2.0 * uncertainty):
             message = (
                 f"median of {np.rad2deg(offset):.3g} deg while driving straight ahead "
-                f"(|yaw_rate| < {STRAIGHT_YAW_RATE:g} rad/s, {seconds:.3g} s)"
+                f"(|yaw_rate| < {STRAIGHT_YAW_RATE:g} rad/s, {seconds:.3g} s); "
+                f"the transform offset_correction removes it ({name}: {offset:.3g} rad)"
             )
-            remedy = f"the transform offset_correction removes it ({name}: {offset:.3g} rad)"
-            yield Finding("warning", "offset", name, f"{message}; {remedy}")
+            yield Finding("warning", "offset", name, message)
 
 
 def _full_turns(recording: Recording, _: BoolArray) -> Iterator[Finding]:
@@ -631,14 +620,10 @@ def _wheel_dropout(recording: Recording, _: BoolArray) -> Iterator[Finding]:
         if len(runs):
             message = (
                 f"{number_of(len(runs), 'dropout')}: below {100 * DROPOUT_SHARE:g} % of the other "
-                f"wheels' speed, the longest {_longest(runs, recording)}"
+                f"wheels' speed, the longest {_longest(runs, recording)}; the transform "
+                "speed_from_wheels ignores such a wheel"
             )
-            yield Finding(
-                "warning",
-                "dropout",
-                name,
-                f"{message}; the transform speed_from_wheels ignores such a wheel",
-            )
+            yield Finding("warning", "dropout", name, message)
 
 
 def _reverse(recording: Recording, _: BoolArray) -> Iterator[Finding]:
@@ -672,9 +657,9 @@ def _unsigned_speed(recording: Recording, _: BoolArray) -> Iterator[Finding]:
     if "vx_ref" in recording:
         backwards = recording["vx_ref"] < -REVERSE_SPEED
     else:
-        second = np.full(min(round(recording.rate_hz) or 1, len(recording)), 1.0)
+        n_second = min(round(recording.rate_hz) or 1, len(recording))
         rate, ay, turned = (
-            np.convolve(recording[name], second / len(second), "same")
+            np.convolve(recording[name], np.full(n_second, 1.0 / n_second), "same")
             for name in ("yaw_rate", "ay", angle)
         )
         turns = np.abs(rate) > MIN_REVERSE_YAW_RATE
@@ -686,14 +671,10 @@ def _unsigned_speed(recording: Recording, _: BoolArray) -> Iterator[Finding]:
     if len(runs):
         message = (
             f"unsigned: positive while the car reverses in {number_of(len(runs), 'segment')}, "
-            f"the longest {_longest(runs, recording)}"
+            f"the longest {_longest(runs, recording)}; exclude the range (start and stop in the "
+            "split), or record a signed speed"
         )
-        yield Finding(
-            "warning",
-            "reverse",
-            "vx",
-            f"{message}; exclude the range (start and stop in the split), or record a signed speed",
-        )
+        yield Finding("warning", "reverse", "vx", message)
 
 
 def _lasting_runs(backwards: BoolArray, recording: Recording) -> NDArray[np.int64]:

@@ -190,8 +190,6 @@ def _pair(
     """The delay of one signal behind another, in a list; empty where it is missing or not
     established. ``tilted``: gravity by body tilt adds to the uncertainty.
     """
-    if not {source, follower} <= set(spectra.names):
-        return []
     lag = lag_of(spectra, source, follower, low_pass=False)
     if lag is None or lag.fit < MIN_PHASE_SHARE or not _sound(lag.delay):
         return []
@@ -259,27 +257,20 @@ def _late(delays: Sequence[Delay]) -> list[Late]:
     The reference's channels have one clock: a yaw rate that is surely on time beside yaw_rate_ref
     is not late behind vy_ref.
     """
-    reported = [
-        delay
-        for delay in delays
-        if abs(delay.delay.value) - delay.delay.half_width > MIN_REPORTED_DELAY_SECONDS
-    ]  # with its whole interval
-    late = [delay if delay.delay.value > 0.0 else delay.turned for delay in reported]
-    late = [
-        delay
-        for delay in late
-        if delay.against not in SPEEDS_WITH_SLIP or (delay.channel, delay.against) == ("ax", "vx")
-    ]
-    within = [
-        delay
+    punctual = {
+        delay.channel
         for delay in delays
         if abs(delay.delay.value) + delay.delay.half_width < MIN_REPORTED_DELAY_SECONDS
-    ]
-    punctual = {delay.channel for delay in within if delay.against.endswith(REFERENCE_SUFFIX)}
+        and delay.against.endswith(REFERENCE_SUFFIX)
+    }
     late = [
         delay
-        for delay in late
-        if not (delay.channel in punctual and delay.against.endswith(REFERENCE_SUFFIX))
+        for delay in (either if either.delay.value > 0.0 else either.turned for either in delays)
+        if delay.delay.low > MIN_REPORTED_DELAY_SECONDS  # with its whole interval
+        and (
+            delay.against not in SPEEDS_WITH_SLIP or (delay.channel, delay.against) == ("ax", "vx")
+        )
+        and not (delay.channel in punctual and delay.against.endswith(REFERENCE_SUFFIX))
     ]
     groups = []
     for channel in dict.fromkeys(delay.channel for delay in late):
@@ -287,16 +278,10 @@ def _late(delays: Sequence[Delay]) -> list[Late]:
         signals = "; ".join(
             dict.fromkeys(delay.signals for delay in delays_of_channel if delay.signals != "both")
         )
-        intervals = [
-            (
-                delay.against,
-                *(1e3 * ms for ms in (delay.delay.value, delay.delay.low, delay.delay.high)),
-            )
-            for delay in delays_of_channel
-        ]
         figures = " and ".join(
-            f"{ms:.0f} ms (95 %: {low:.0f} to {high:.0f} ms) relative to {name}"
-            for name, ms, low, high in intervals
+            f"{1e3 * delay.delay.value:.0f} ms (95 %: {1e3 * delay.delay.low:.0f} to "
+            f"{1e3 * delay.delay.high:.0f} ms) relative to {delay.against}"
+            for delay in delays_of_channel
         )
         text = (
             f"delayed{', like the other wheels,' if channel in CHANNELS_OF_SIGNAL else ''} by "

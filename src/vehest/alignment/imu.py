@@ -138,9 +138,8 @@ def fit_imu(recording: Recording, settings: AlignmentSettings, names: Sequence[s
         if "offset_ax" in names:
             expected = expected - expected.mean()
             measured = measured - measured.mean()
-        start["yaw"] = -float(
-            np.angle(np.vdot(expected, measured))
-        )  # brings both together best, without delay and lever arm
+        # brings both together best, without delay and lever arm
+        start["yaw"] = -float(np.angle(np.vdot(expected, measured)))
     correlation = _cross_correlation(signals, start["yaw"], settings)
     if "delay" in names:
         _require_peak(recording, correlation, settings)
@@ -487,15 +486,12 @@ def _require_peak(
     delays that are searched.
     """
     if correlation.highest < MIN_CORRELATION:
-        problem = (
-            f"the {correlation.signal} of sensor and reference has a correlation of at most "
-            f"{correlation.highest:.2f} (required: {MIN_CORRELATION:g})"
-        )
-        fix = (
+        raise DataError(
+            f"recording '{recording.id}': the {correlation.signal} of sensor and reference has a "
+            f"correlation of at most {correlation.highest:.2f} (required: {MIN_CORRELATION:g}); "
             "check units, signs and channels (vehest data check), or raise max_delay "
             f"({settings.max_delay:g} s)"
         )
-        raise DataError(f"recording '{recording.id}': {problem}; {fix}")
     if correlation.at_end:
         raise DataError(
             f"recording '{recording.id}': the largest correlation is at the limit of the searched "
@@ -534,10 +530,10 @@ def _most_likely(
             damping = max(damping, 1e-4) * 10.0
         if settled:
             return fit
-    fix = f"request fewer quantities, lower the cut-off, or use a drive with {MORE_MOTION}"
     raise DataError(
         f"recording '{model.signals.recording.id}': the estimate of {listed(requested)} does not "
-        f"converge; {fix}"
+        "converge; request fewer quantities, lower the cut-off, or use a drive with "
+        f"{MORE_MOTION}"
     )
 
 
@@ -579,12 +575,11 @@ def require_condition(
         for name, part in zip(names, weakest, strict=True)
         if abs(part) > 0.3
     ]
-    problem = (
-        f"{listed(list(dict.fromkeys(confused)))} cannot be separated in this drive "
-        f"(condition number {condition:.2g}, at most {MAX_CONDITION:g})"
+    raise DataError(
+        f"recording '{recording.id}': {listed(list(dict.fromkeys(confused)))} cannot be separated "
+        f"in this drive (condition number {condition:.2g}, at most {MAX_CONDITION:g}); request "
+        "fewer quantities, or use a drive with varying speed and turns both ways"
     )
-    fix = "request fewer quantities, or use a drive with varying speed and turns both ways"
-    raise DataError(f"recording '{recording.id}': {problem}; {fix}")
 
 
 def condition_of(information: FloatArray) -> float:
@@ -620,17 +615,14 @@ def _noise_of_columns(signals: Signals) -> dict[str, tuple[float, float, float]]
     ahead = slope * speed_noise
     aside = math.hypot(slope * side_noise, level * speed * rate_noise)
     arm = math.hypot(2.0 * turning * level * rate_noise, slope * rate_noise) / math.sqrt(2.0)
-    by_offset = (
-        (level * side_noise, level * speed_noise, 0.0)
-        if signals.reference_rate is None
-        else (0.0, 0.0, 0.0)
-    )
-    return dict.fromkeys(IMU_PARAMETERS, (0.0, 0.0, 0.0)) | {
+    no_noise = (0.0, 0.0, 0.0)
+    by_offset = (level * side_noise, level * speed_noise, 0.0)
+    return dict.fromkeys(IMU_PARAMETERS, no_noise) | {
         "lever_x": (arm, arm, 0.0),
         "lever_y": (arm, arm, 0.0),
         "yaw": (aside, ahead, 0.0),
         "delay": (bend * speed_noise, bend * side_noise, slope * rate_noise),
-        "offset_yaw_rate": by_offset,
+        "offset_yaw_rate": by_offset if signals.reference_rate is None else no_noise,
         "tilt_gain_x": (ahead, 0.0, 0.0),
         "tilt_gain_y": (0.0, aside, 0.0),
         "tilt_lag_x": (bend * speed_noise, 0.0, 0.0),
@@ -662,13 +654,11 @@ def _require_identified(
             / unique[index]
         )
         if share > MAX_NOISE_SHARE:
-            problem = (
-                f"{100 * min(share, 1.0):.0f} % of its effect in this drive is noise (at most "
-                f"{100 * MAX_NOISE_SHARE:g} %)"
-            )
-            fix = f"lower the cut-off, or use a drive with {MORE_MOTION}"
             raise DataError(
-                f"recording '{signals.recording.id}': {name} cannot be estimated: {problem}; {fix}"
+                f"recording '{signals.recording.id}': {name} cannot be estimated: "
+                f"{100 * min(share, 1.0):.0f} % of its effect in this drive is noise (at most "
+                f"{100 * MAX_NOISE_SHARE:g} %); lower the cut-off, or use a drive with "
+                f"{MORE_MOTION}"
             )
 
 
@@ -696,12 +686,9 @@ def require_length(recording: Recording, usable: float, lost: float) -> None:
     """
     min_seconds = MIN_BLOCKS * MIN_BLOCK_SECONDS
     if usable < min_seconds:
-        requirement = (
-            f"an uncertainty needs at least {min_seconds + lost:.3g} s, of which {lost:.2g} s for "
-            "filtering and shifting"
-        )
         raise DataError(
-            f"recording '{recording.id}' lasts {recording.duration:.3g} s; {requirement}"
+            f"recording '{recording.id}' lasts {recording.duration:.3g} s; an uncertainty needs at "
+            f"least {min_seconds + lost:.3g} s, of which {lost:.2g} s for filtering and shifting"
         )
 
 
@@ -760,12 +747,10 @@ def _uncertainties(
     scatter = np.sqrt(np.diag(scatter_of(fit, blocks)))
     if tilt == 0.0:
         return scatter, np.zeros(len(fit.names))
+    # change of each parameter by an error of either axis at one time
     pull = np.linalg.solve(
         fit.information, (fit.columns[:, :2] * fit.weights[:2, None]).reshape(len(fit.names), -1)
-    )
-    pull = pull.reshape(
-        len(fit.names), 2, -1
-    )  # change of each parameter by an error of either axis at one time
+    ).reshape(len(fit.names), 2, -1)
     moving = pull - pull.mean(axis=2, keepdims=True)
     deviation = _deviation(ROAD_CUTOFF, rate_hz)
     slow, road = (
@@ -908,7 +893,8 @@ def smoothing_of(recording: Recording, cutoff_hz: float) -> Smoothing:
     ConfigurationError
         The kernel is too narrow to be sampled, or longer than the limit.
     """
-    length = 2 * KERNEL_REACH * _deviation(cutoff_hz, recording.rate_hz)
+    deviation = _deviation(cutoff_hz, recording.rate_hz)
+    length = 2 * KERNEL_REACH * deviation
     subject = (
         f"recording '{recording.id}': a low-pass at {cutoff_hz:g} Hz reaches over {length:.6g} "
         "samples"
@@ -916,12 +902,12 @@ def smoothing_of(recording: Recording, cutoff_hz: float) -> Smoothing:
     check_limit("filter_samples", length, subject, ConfigurationError)
     limit = MAX_CUTOFF_SHARE * recording.rate_hz
     if cutoff_hz > limit:
-        fix = f"use at most {math.floor(100 * limit) / 100:g} Hz, or a recording at its native rate"
         raise ConfigurationError(
             f"recording '{recording.id}': a cut-off of {cutoff_hz:g} Hz is too high for "
-            f"{recording.rate_hz:g} Hz; {fix}"
+            f"{recording.rate_hz:g} Hz; use at most {math.floor(100 * limit) / 100:g} Hz, or a "
+            "recording at its native rate"
         )
-    return Smoothing(_deviation(cutoff_hz, recording.rate_hz), recording.rate_hz)
+    return Smoothing(deviation, recording.rate_hz)
 
 
 def require_complete(recording: Recording, names: Sequence[str], quantities: str) -> None:

@@ -9,7 +9,9 @@ import numpy as np
 from vehest.alignment.standstill import BoolArray
 from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
+from vehest.data.derived import derivative
 from vehest.data.recording import Recording
+from vehest.data.runs import filled
 
 # largest sample over the largest that a vehicle can do; beyond lies no wrong unit
 MAX_EXCESS = 100.0
@@ -92,11 +94,7 @@ class Motion:
         FloatArray
             (T,), per second; one-sided differences at both ends, zeros for a single sample.
         """
-        return (
-            np.asarray(np.gradient(samples) * self.rate_hz, dtype=np.float64)
-            if len(samples) > 1
-            else np.zeros(len(samples))
-        )
+        return derivative(samples, self.rate_hz)
 
     def slower(self, factor: int) -> Motion:
         """Means of so many samples each, at a rate that is so many times slower.
@@ -165,14 +163,10 @@ def _bridged(recording: Recording, name: str) -> FloatArray | None:
     """Samples of a channel without gaps; None where too many are missing, or one is beyond
     MAX_EXCESS times what is possible.
     """
-    samples = recording[name]
+    if np.isnan(recording[name]).mean() > MAX_MISSING_SHARE:
+        return None
+    samples = filled(recording[name])
     described = CHANNELS[name]
-    unknown = np.isnan(samples) if name in recording.gappy else None
-    if unknown is not None and unknown.any():
-        if unknown.mean() > MAX_MISSING_SHARE:
-            return None
-        places = np.arange(len(samples))
-        samples = np.interp(places, places[~unknown], samples[~unknown])
     bound = MAX_EXCESS * max(abs(described.low), abs(described.high))
     return None if np.abs(samples).max() > bound else samples
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 
 import numpy as np
 
@@ -109,34 +108,21 @@ def offset_findings(motion: Motion) -> list[Finding]:
         At most one of each. Neither can be told from an inclined sensor or road, nor that of ay,
         at about one speed, from an offset of the yaw rate; the message states the causes.
     """
-    return [*_lateral_findings(motion), *_longitudinal_findings(motion)]
-
-
-def _longitudinal_findings(motion: Motion) -> Iterator[Finding]:
-    """A warning of an offset of ax beyond any road."""
+    findings = []
+    offset = lateral_offset(motion)
+    if offset is not None and abs(offset.value) >= max(MIN_NOTED_OFFSET, offset.half_width):
+        level: Level = "warning" if abs(offset.value) > MAX_NOTED_OFFSET else "note"
+        turning = -offset.value / max(float(np.mean(np.abs(motion.vx[motion.moving]))), 0.1)
+        is_small = abs(turning) < MAX_GYRO_OFFSET
+        gyro = f", or a yaw_rate offset of {turning:.3f} rad/s" if is_small else ""
+        sliding = f" + d({motion.velocity})/dt" if motion.velocity else ""
+        text = _described(offset, f"{motion.speed}·yaw_rate{sliding}", gyro)
+        findings.append(Finding(level, "offset", "ay", text))
     offset = longitudinal_offset(motion)
     if offset is not None and abs(offset.value) - offset.half_width > MAX_NOTED_OFFSET:
-        yield Finding("warning", "offset", "ax", _described(offset, f"d({motion.speed})/dt"))
-
-
-def _lateral_findings(motion: Motion) -> Iterator[Finding]:
-    """A note or a warning of an offset of ay."""
-    offset = lateral_offset(motion)
-    if (
-        offset is None
-        or abs(offset.value) < MIN_NOTED_OFFSET
-        or abs(offset.value) < offset.half_width
-    ):
-        return
-    level: Level = "warning" if abs(offset.value) > MAX_NOTED_OFFSET else "note"
-    turning = -offset.value / max(float(np.mean(np.abs(motion.vx[motion.moving]))), 0.1)
-    gyro = (
-        f", or a yaw_rate offset of {turning:.3f} rad/s" if abs(turning) < MAX_GYRO_OFFSET else ""
-    )
-    expected = f"{motion.speed}·yaw_rate" + (
-        f" + d({motion.velocity})/dt" if motion.velocity else ""
-    )
-    yield Finding(level, "offset", "ay", _described(offset, expected, gyro))
+        text = _described(offset, f"d({motion.speed})/dt")
+        findings.append(Finding("warning", "offset", "ax", text))
+    return findings
 
 
 def _described(offset: Measured, expected: str, another_cause: str = "") -> str:

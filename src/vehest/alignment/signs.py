@@ -122,17 +122,11 @@ def relations_of(motion: Motion) -> list[Relation]:
     list of Relation
         Lateral ones first, then steering, longitudinal, and quantities that are measured twice.
     """
-    relations = [
+    return [
         relation
         for relations_between in (_lateral, _steered, _longitudinal, _repeated)
         for relation in relations_between(motion)
-    ]
-    return [
-        relation
-        for relation in relations
-        if np.isfinite(relation.scale)
-        and np.isfinite(relation.correlation)
-        and relation.scale != 0.0
+        if np.isfinite([relation.scale, relation.correlation]).all() and relation.scale != 0.0
     ]
 
 
@@ -151,7 +145,7 @@ def _lateral(motion: Motion) -> Iterator[Relation]:
     if np.count_nonzero(moving) < MIN_SAMPLES or measured.std() < MIN_ACCELERATION:
         return
     product = f"{motion.speed}·yaw_rate"
-    steady = (samples[moving] - samples[moving].mean() for samples in (measured, turning))
+    steady = _centred(moving, measured, turning)
     yield from _related("ay", product, ("ay", "yaw_rate", motion.speed), (1, -1, -1), *steady)
     band = kinematic_band(motion)
     if not motion.velocity or band is None:
@@ -163,13 +157,11 @@ def _lateral(motion: Motion) -> Iterator[Relation]:
         return
     right, left = _without(np.stack([p, steep / motion.rate_hz], axis=1), a, d)
     n_suspects = 2 if motion.velocity == "vy_ref" else 3  # a velocity does not hang on the speed
-    channels = (motion.velocity, "ay", motion.speed)[:n_suspects]
-    powers = (1, -1, 1)[:n_suspects]
     yield from _related(
         f"d({motion.velocity})/dt",
         f"ay - {product}",
-        channels,
-        powers,
+        (motion.velocity, "ay", motion.speed)[:n_suspects],
+        (1, -1, 1)[:n_suspects],
         left,
         right,
         MIN_SIGN_CORRELATION,
@@ -185,10 +177,7 @@ def _steered(motion: Motion) -> Iterator[Relation]:
         rolling &= np.abs(motion.vy) < MAX_ROLLING_SIDESLIP * np.abs(motion.vx)
     if np.count_nonzero(rolling) >= max(MIN_STEERED_SECONDS * motion.rate_hz, MIN_SAMPLES):
         names = (motion.steering, "yaw_rate", motion.speed)
-        steady = (
-            samples[rolling] - samples[rolling].mean()
-            for samples in (motion.vx * motion[motion.steering], motion["yaw_rate"])
-        )
+        steady = _centred(rolling, motion.vx * motion[motion.steering], motion["yaw_rate"])
         yield from _related(
             motion.steering, "yaw_rate", names, (1, -1, 1), *steady, tolerance=np.inf
         )
@@ -225,28 +214,31 @@ def _repeated(motion: Motion) -> Iterator[Relation]:
         moving = motion.moving
         if name in motion and reference in motion and np.count_nonzero(moving) >= MIN_SAMPLES:
             pair = (name, reference)
-            steady = (
-                motion[channel][moving] - motion[channel][moving].mean() for channel in pair
-            )  # slip is no factor: means alone would agree
+            # slip is no factor: means alone would agree
+            steady = _centred(moving, motion[name], motion[reference])
             yield from _related(*pair, pair, (1, -1), *steady)
     if motion.velocity == "vy_ref" and "sideslip_ref" in motion:
-        forwards = motion.moving & (
-            motion.vx > 0.0
-        )  # the angle of a car that goes backwards is taken either way
+        # the angle of a car that goes backwards is taken either way
+        forwards = motion.moving & (motion.vx > 0.0)
         angle = motion["sideslip_ref"][forwards]
         expected = np.arctan2(motion.vy, motion.vx)[forwards]
         if len(expected) >= MIN_SAMPLES and np.std(expected) >= MIN_SIDESLIP:
-            names = ("sideslip_ref", "vy_ref", motion.speed)
-            right = f"atan2(vy_ref, {motion.speed})"
             yield from _related(
                 "sideslip_ref",
-                right,
-                names,
+                f"atan2(vy_ref, {motion.speed})",
+                ("sideslip_ref", "vy_ref", motion.speed),
                 (1, -1, 1),
                 angle,
                 expected,
                 least_correlation=MIN_ANGLE_CORRELATION,
             )
+
+
+def _centred(
+    rows: BoolArray, first: FloatArray, second: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Selected samples of two signals (T,) about their means."""
+    return first[rows] - first[rows].mean(), second[rows] - second[rows].mean()
 
 
 def _related(
@@ -401,16 +393,13 @@ def sign_findings(
         names = dict.fromkeys(name for relation in against for name in relation.channels)
         advice = f"signs are inconsistent ({evidence}); check those of {listed(list(names))}"
         return [Finding("warning", "sign", "", advice, tuple(names))]
-    if (
-        motion.speed,
-    ) in explanations:  # only suspected where it is negative, where the check reverse warns
+    # only suspected where it is negative, where the check reverse warns
+    if (motion.speed,) in explanations:
         return []
-    best = explanations[0]
-    alternatives = explanations[1:]
+    best, *alternatives = explanations
     if _decided(relations, explanations):
-        alternative = (
-            f", or instead {' or '.join(map(_together, alternatives))}" if alternatives else ""
-        )
+        instead = " or ".join(map(_together, alternatives))
+        alternative = f", or instead {instead}" if alternatives else ""
         advice = f"sign reversed ({evidence}); set sign: -1 for {listed(best)}{alternative}"
         return [Finding("warning", "sign", name, advice) for name in best]
     either = " or ".join(map(_together, explanations))
@@ -450,17 +439,15 @@ class UnitMistake(NamedTuple):
     declared: str  # unit in which they were read
 
 
-def unit_mistakes() -> Iterator[UnitMistake]:
-    """Mistakes of units that are looked for.
-
-    Yields
-    ------
-    UnitMistake
-        For each channel of ALTERNATIVE_UNITS: other unit read as SI, and SI read as the other.
-    """
-    for channel, (factor, unit, si) in ALTERNATIVE_UNITS.items():
-        yield UnitMistake(channel, factor, unit, si)
-        yield UnitMistake(channel, 1.0 / factor, si, unit)
+# other unit read as SI, and SI read as the other
+UNIT_MISTAKES = [
+    mistake
+    for channel, (factor, unit, si) in ALTERNATIVE_UNITS.items()
+    for mistake in (
+        UnitMistake(channel, factor, unit, si),
+        UnitMistake(channel, 1.0 / factor, si, unit),
+    )
+]
 
 
 @dataclass(frozen=True)
@@ -516,7 +503,7 @@ def wrong_unit(relations: Sequence[Relation]) -> WrongUnit | None:
     if not wrong:
         return None
     explained: dict[UnitMistake, list[Relation]] = {}
-    for mistake in unit_mistakes():
+    for mistake in UNIT_MISTAKES:
         put_right = [
             relation
             for relation in wrong

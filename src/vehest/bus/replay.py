@@ -120,11 +120,10 @@ class Bus:
                 opened.append(can.Bus(**options))
                 opened.append(can.Bus(**options, can_filters=filters))
             except Exception as error:  # each interface has errors of its own
-                fault = (
+                raise MissingError(
                     f"cannot open channel '{self.channel}' of interface '{self.interface}' "
-                    f"({first_line(error)[:160]})"
-                )
-                raise MissingError(f"{fault}; --interface virtual needs nothing") from None
+                    f"({first_line(error)[:160]}); --interface virtual needs nothing"
+                ) from None
             yield opened[0], opened[1]
         finally:
             for connection in opened:

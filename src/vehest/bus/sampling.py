@@ -96,9 +96,8 @@ def _phase(times: FloatArray, period: float, cycle: float) -> float | None:
     """Time within a cycle at which frames arrive [s], by their circular mean; None if they arrive
     at any time.
     """
-    if abs(period / cycle - max(round(period / cycle), 1)) > MAX_PERIOD_DEVIATION * max(
-        period / cycle, 1.0
-    ):
+    cycles = period / cycle
+    if abs(cycles - max(round(cycles), 1)) > MAX_PERIOD_DEVIATION * max(cycles, 1.0):
         return None
     mean = complex(np.exp(2j * np.pi * (times / cycle)).mean())
     return float(np.angle(mean) / (2 * np.pi) * cycle % cycle) if abs(mean) > 0.5 else None
@@ -117,10 +116,11 @@ def check_samples(first: float, last: float, rate_hz: float, location: str) -> N
         Begins the error.
     """
     n_samples = (last - first) * rate_hz
-    fault = f"from {first:.12g} s to {last:.12g} s at {rate_hz:.6g} Hz"
-    remedy = "remove a frame with a stray stamp"
     check_limit(
-        "samples", n_samples, f"{location} would give {n_samples:.0f} samples {fault} ({remedy})"
+        "samples",
+        n_samples,
+        f"{location} would give {n_samples:.0f} samples from {first:.12g} s to {last:.12g} s at "
+        f"{rate_hz:.6g} Hz (remove a frame with a stray stamp)",
     )
 
 
@@ -164,10 +164,9 @@ class Sampler:
             self._values[name] = value
             self._stamps[name] = stamp
         if self.timing.clock in values:
-            early = (
-                stamp - self.next_time + self.timing.offset + 0.5 * self.cycle
-            ) % self.cycle - 0.5 * self.cycle
-            self._deviation = min(max(early, -0.25 * self.cycle), 0.25 * self.cycle)
+            half = 0.5 * self.cycle
+            early = (stamp - self.next_time + self.timing.offset + half) % self.cycle - half
+            self._deviation = min(max(early, -0.5 * half), 0.5 * half)
 
     def samples_before(self, now: float) -> Iterator[Sample]:
         """Samples whose instant lies before ``now`` [s].

@@ -16,6 +16,8 @@ Sources differ by 4 % on the wheelbase of a Volvo V40. Five passengers are 25 % 
 mass.
 """
 
+LENGTHS = ("wheelbase", "cg_to_rear_axle", "imu_to_rear_axle")  # values in metres
+
 
 @dataclass(frozen=True)
 class CarValues:
@@ -65,12 +67,9 @@ class CarValues:
 
     def scaled(self, factor: float) -> CarValues:
         """The car with its lengths multiplied by a factor; its mass is unknown then."""
-        wheelbase = None if self.wheelbase is None else factor * self.wheelbase
-        rear = None if self.cg_to_rear_axle is None else factor * self.cg_to_rear_axle
-        imu = None if self.imu_to_rear_axle is None else factor * self.imu_to_rear_axle
-        return replace(
-            self, wheelbase=wheelbase, cg_to_rear_axle=rear, mass=None, imu_to_rear_axle=imu
-        )
+        lengths = {name: getattr(self, name) for name in LENGTHS}
+        scaled = {name: length and factor * length for name, length in lengths.items()}
+        return replace(self, mass=None, **scaled)
 
     def difference_to(self, second: CarValues) -> str:
         """Text of the first value in which this and another car differ too much to be the same,

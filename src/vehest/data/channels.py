@@ -83,31 +83,15 @@ def _table() -> dict[str, Channel]:
         ),
     ]
     for corner, place in corners.items():
-        rows.append(
-            Channel(
-                f"wheel_speed_{corner}",
-                "rad/s",
-                f"rotational speed of the {place} wheel",
-                -500.0,
-                1000.0,
-            )
-        )
+        meaning = f"rotational speed of the {place} wheel"
+        rows.append(Channel(f"wheel_speed_{corner}", "rad/s", meaning, -500.0, 1000.0))
     for corner, place in corners.items():
-        rows.append(
-            Channel(
-                f"wheel_torque_{corner}",
-                "N·m",
-                f"driving torque at the {place} wheel",
-                -2e4,
-                2e4,
-                rests=True,
-            )
-        )
+        meaning = f"driving torque at the {place} wheel"
+        rows.append(Channel(f"wheel_torque_{corner}", "N·m", meaning, -2e4, 2e4, rests=True))
     for axis, direction in {"x": "longitudinal", "y": "lateral", "z": "vertical"}.items():
         for corner, place in corners.items():
-            rows.append(
-                Channel(f"f{axis}_{corner}", "N", f"{direction} tyre force, {place}", -2e5, 2e5)
-            )
+            meaning = f"{direction} tyre force, {place}"
+            rows.append(Channel(f"f{axis}_{corner}", "N", meaning, -2e5, 2e5))
     rows += [
         Channel(
             "vx_ref", "m/s", "reference forward velocity at the centre of gravity", -40.0, 140.0

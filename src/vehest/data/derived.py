@@ -294,10 +294,10 @@ class VelocityFromSideslip:
         moving = is_sideways & ~(np.abs(recording[speed]) < STANDSTILL_SPEED)
         if moving.any():
             worst = int(np.argmax(np.where(moving, np.abs(angle), 0.0)))
-            problem = f"sideslip_ref is {angle[worst]:.4g} rad at {recording.time[worst]:.12g} s"
             raise DataError(
-                f"recording '{recording.id}': {problem}; lateral velocity follows from less than "
-                "90 degrees only"
+                f"recording '{recording.id}': sideslip_ref is {angle[worst]:.4g} rad at "
+                f"{recording.time[worst]:.12g} s; lateral velocity follows from less than 90 "
+                "degrees only"
             )
         return recording.with_channels(
             {"vy_ref": recording[speed] * np.tan(np.where(is_sideways, 0.0, angle))},

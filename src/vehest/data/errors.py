@@ -55,11 +55,12 @@ def listed(words: Sequence[str]) -> str:
 
 def counted(names: Sequence[str]) -> str:
     """Text of the number of names and, in brackets, of the first six of them."""
-    return (
-        f"{len(names)} ({', '.join([*names[:6], *(['…'] if len(names) > 6 else [])])})"
-        if names
-        else "0"
-    )
+    return f"{len(names)} ({first_of(names, 6)})" if names else "0"
+
+
+def first_of(names: Sequence[str], max_named: int) -> str:
+    """The first of some names, followed by ``…`` where there are more."""
+    return ", ".join([*names[:max_named], *["…"] * (len(names) > max_named)])
 
 
 def number_of(count: int, noun: str) -> str:

@@ -19,12 +19,10 @@ from pathlib import Path
 from vehest.data.errors import DataError, MissingError, VehestError, closest
 
 ASIDE_PREFIX = ".writing-"  # start of the name of a file or folder that is being written
-_ASIDE = re.compile(
-    rf"{re.escape(ASIDE_PREFIX)}(\d+)-(?:([0-9a-f]{{8}})[0-9a-f]{{8}}-)?"
-)  # process and host before the name
-FOREIGN_SECONDS = (
-    24 * 3600.0
-)  # after which files of another host count as left over, whose processes cannot be seen from here
+# process and host before the name
+_ASIDE = re.compile(rf"{re.escape(ASIDE_PREFIX)}(\d+)-(?:([0-9a-f]{{8}})[0-9a-f]{{8}}-)?")
+# after which files of another host count as left over, whose processes cannot be seen from here
+FOREIGN_SECONDS = 24 * 3600.0
 # numbers of the errors of a full disk
 NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 # words in the text of an error without a number -> number of the error

@@ -92,20 +92,20 @@ def fold_of(
     dealt = np.minimum((middles / lengths.sum() * folds.number).astype(np.int64), folds.number - 1)
     empty = sorted(set(range(folds.number)) - set(dealt.tolist()))
     if empty:
-        problem = (
-            f"{len(blocks)} blocks ({folds.of}) do not fill {folds.number} folds, number "
-            f"{empty[0]} stays empty"
-        )
         raise ConfigurationError(
-            f"{subject}: {problem}; take fewer folds, or of: seconds with a shorter block_seconds"
+            f"{subject}: {len(blocks)} blocks ({folds.of}) do not fill {folds.number} folds, "
+            f"number {empty[0]} stays empty; take fewer folds, or of: seconds with a shorter "
+            "block_seconds"
         )
     roles = np.where(dealt == fold, 2, np.where(dealt == (fold + 1) % folds.number, 1, 0)).tolist()
     train, validation, test = (
         _joined(blocks, roles, role, 0.0 if role == 2 else folds.gap_seconds) for role in range(3)
     )
     if not (train and validation):
-        problem = f"gaps of {folds.gap_seconds:g} s leave fold {fold} nothing to train on"
-        raise ConfigurationError(f"{subject}: {problem}; set folds.gap_seconds lower")
+        raise ConfigurationError(
+            f"{subject}: gaps of {folds.gap_seconds:g} s leave fold {fold} nothing to train on; "
+            "set folds.gap_seconds lower"
+        )
     return train, validation, test
 
 

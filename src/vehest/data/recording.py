@@ -86,16 +86,13 @@ class Recording(TimeSeries):
             bad = np.flatnonzero(np.isinf(samples) if name in self.gappy else ~np.isfinite(samples))
             if len(bad):
                 first, last = (self.start_time + bad[[0, -1]] / self.rate_hz).tolist()
-                problem = (
-                    f"{len(bad)} {'NaN' if np.isnan(samples[bad]).all() else 'infinite values'} "
-                    f"between {first:.12g} s and {last:.12g} s"
+                kind = "NaN" if np.isnan(samples[bad]).all() else "infinite values"
+                raise DataError(
+                    f"recording '{self.id}': channel '{name}' holds {len(bad)} {kind} between "
+                    f"{first:.12g} s and {last:.12g} s; cut the range out (max_gap of the data set "
+                    "ends a recording there), or declare the channel in 'gappy' if a gap means "
+                    "'not measured'"
                 )
-                fix = (
-                    "cut the range out (max_gap of the data set ends a recording there), or "
-                    "declare "
-                    "the channel in 'gappy' if a gap means 'not measured'"
-                )
-                raise DataError(f"recording '{self.id}': channel '{name}' holds {problem}; {fix}")
 
     @property
     def label(self) -> str:

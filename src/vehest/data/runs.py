@@ -1,4 +1,4 @@
-"""Runs of samples: where flags hold, and where values stay the same."""
+"""Runs of samples: where flags hold, where values stay the same, and lines over gaps."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from vehest.constants import FloatArray
 
 
 def true_runs(flags: NDArray[np.bool_]) -> NDArray[np.int64]:
@@ -22,3 +24,14 @@ def equal_runs(samples: NDArray[Any]) -> NDArray[np.int64]:
     changes = np.flatnonzero(samples[1:] != samples[:-1]) + 1
     edges = np.concatenate([[0], changes, [len(samples)]])
     return np.stack([edges[:-1], edges[1:]], axis=1)[: len(samples)]
+
+
+def filled(samples: FloatArray) -> FloatArray:
+    """Samples (T,) with straight lines over gaps (NaN); zeros where no sample is finite."""
+    is_finite = np.isfinite(samples)
+    if is_finite.all():
+        return samples
+    if not is_finite.any():
+        return np.zeros_like(samples)
+    at = np.arange(len(samples))
+    return np.interp(at, at[is_finite], samples[is_finite])

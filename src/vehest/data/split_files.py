@@ -13,7 +13,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, PositiveFloat
 
-from vehest.data.errors import ConfigurationError
+from vehest.data.errors import ConfigurationError, first_of
 from vehest.data.folds import FoldsFile, blocks_of, fold_of
 from vehest.data.laps import laps_of
 from vehest.data.recording import Recording
@@ -356,12 +356,10 @@ class _Ranges:
         begin = int(first) if first else 1 if end == "first" else len(laps) - count + 1
         stop = int(last or first) if first else begin + count - 1
         if not 1 <= begin <= stop <= len(laps):
-            problem = (
-                f"{len(laps)} complete laps were found" if laps else "its course does not repeat"
-            )
+            found = f"{len(laps)} complete laps were found"
             raise ConfigurationError(
-                f"{self._subject}: recording '{name}' has no '{words.strip()}': {problem}; name "
-                "times instead"
+                f"{self._subject}: recording '{name}' has no '{words.strip()}': "
+                f"{found if laps else 'its course does not repeat'}; name times instead"
             )
         return laps[begin - 1][0], laps[stop - 1][1]
 
@@ -383,13 +381,9 @@ class _Ranges:
         recordings = self._recordings(dataset)
         names = sorted(name for name in recordings if fnmatchcase(name, pattern))
         if not names:
-            available = ", ".join(
-                [*sorted(recordings)[:5], *(["…"] if len(recordings) > 5 else [])]
-            )
             raise ConfigurationError(
                 f"{self._subject}: no recording of data set '{dataset}' matches '{pattern}' (it "
-                "has "
-                f"{available})"
+                f"has {first_of(sorted(recordings), 5)})"
             )
         return names
 

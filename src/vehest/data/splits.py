@@ -39,9 +39,8 @@ def check_name(name: str, subject: str) -> None:
     if not re.fullmatch(r"[A-Za-z0-9_]([A-Za-z0-9_.-]*[A-Za-z0-9_-])?", name):
         raise ConfigurationError(
             f"{subject}: '{printable(name[:60])}' must be made of letters A to Z, digits, '_', '-' "
-            "and "
-            "'.', begin with none of the last two and not end with '.'; it becomes part of file "
-            "names"
+            "and '.', begin with none of the last two and not end with '.'; it becomes part of "
+            "file names"
         )
     if len(name) > MAX_NAME_CHARACTERS:
         raise ConfigurationError(
@@ -130,12 +129,10 @@ class Split:
         ]:
             for span, other in product(spans, other_spans):
                 if span.overlaps(other):
-                    problem = (
-                        f"{role} and {other_role} share samples of recording '{span.recording}'"
-                    )
                     raise ConfigurationError(
-                        f"split '{self.name}': {problem} ({span.describe()} and "
-                        f"{other.describe()}); separate the ranges"
+                        f"split '{self.name}': {role} and {other_role} share samples of recording "
+                        f"'{span.recording}' ({span.describe()} and {other.describe()}); separate "
+                        "the ranges"
                     )
 
     @property

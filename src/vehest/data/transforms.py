@@ -34,9 +34,8 @@ from vehest.data.limits import check_limit
 from vehest.data.recording import Recording
 from vehest.data.schema import validated
 
-MAX_DIRECT_TAPS = (
-    8192  # taps up to which a filter is summed sample by sample; longer ones through their spectra
-)
+# taps up to which a filter is summed sample by sample; longer ones through their spectra
+MAX_DIRECT_TAPS = 8192
 OUTPUTS_AT_ONCE = 4096  # output samples that a resampling computes together
 MOST_BRIDGED = 0.1  # largest share of a channel's samples that is bridged
 VALUES_AT_ONCE = 1 << 20  # samples that are compared at a time, windows included
@@ -90,23 +89,19 @@ class Resample:
         exact = Fraction(self.rate_hz) / Fraction(recording.rate_hz)
         ratio = exact.limit_denominator(1000)
         if ratio == 0 or abs(ratio / exact - 1) > Fraction(1, 10**9):
-            problem = (
-                f"{self.rate_hz:g} Hz from {recording.rate_hz:g} Hz is not a ratio of whole "
-                "numbers up to 1000"
+            raise DataError(
+                f"recording '{recording.id}': {self.rate_hz:g} Hz from {recording.rate_hz:g} Hz is "
+                "not a ratio of whole numbers up to 1000"
             )
-            raise DataError(f"recording '{recording.id}': {problem}")
         up = ratio.numerator
         down = ratio.denominator
         if up == down:
             return recording
         if self.method == "decimate":
             if up != 1:
-                problem = (
-                    f"plain decimation from {recording.rate_hz:g} to {self.rate_hz:g} Hz is not "
-                    "a whole ratio"
-                )
                 raise ConfigurationError(
-                    f"recording '{recording.id}': {problem}; use method=polyphase"
+                    f"recording '{recording.id}': plain decimation from {recording.rate_hz:g} to "
+                    f"{self.rate_hz:g} Hz is not a whole ratio; use method=polyphase"
                 )
             channels = {name: samples[::down] for name, samples in recording.channels.items()}
         else:

@@ -54,7 +54,9 @@ import numpy as np
 
 from vehest.alignment.motion import rms
 from vehest.constants import FloatArray
+from vehest.data.derived import derivative
 from vehest.data.recording import Recording
+from vehest.data.runs import filled
 from vehest.data.splits import Span
 from vehest.evaluation.metrics import (
     BoolArray,
@@ -63,18 +65,12 @@ from vehest.evaluation.metrics import (
     pieces_of,
     scored_range,
 )
-from vehest.evaluation.regimes import filled
 from vehest.filters.gaussian import Gaussian
 from vehest.filters.kalman import LinearModel
 from vehest.filters.kalman_scan import kalman_scan
 
-INPUTS = (
-    "vx",
-    "yaw_rate",
-    "ay",
-    "ax",
-    "steer",
-)  # channels that a bound knows what to make of; the first two are needed
+# channels that a bound knows what to make of; the first two are needed
+INPUTS = ("vx", "yaw_rate", "ay", "ax", "steer")
 SETS = (
     ("vx", "yaw_rate"),
     ("vx", "yaw_rate", "ay"),
@@ -85,9 +81,8 @@ SETS = (
 )
 """Sets of inputs whose bounds reports compare."""
 
-STIFFNESS_DEVIATION = (
-    math.log(15.0 / 6.0) / 4.0
-)  # 0.23: 6 to 15 per rad as four standard deviations (Milliken & Milliken 1995)
+# 0.23: 6 to 15 per rad as four standard deviations (Milliken & Milliken 1995)
+STIFFNESS_DEVIATION = math.log(15.0 / 6.0) / 4.0
 BLOCK_SECONDS = 1.0  # s over which residuals are averaged to separate slow from white noise
 SLOW_SECONDS = (2.0, 100.0)  # s, shortest and longest time constant of slow noise
 MIN_SAMPLES = 20  # samples of all drives together; with fewer there is no floor
@@ -98,11 +93,8 @@ UNIFORM_ANGLE_DEVIATION = 180.0 / math.sqrt(3.0)  # deg, of an angle of which no
 MIN_POSITIVE = 1e-9  # least standard deviation of a noise or squared speed, so that none is 0
 
 _SPEEDS = ("motor_speed", "wheel_speed_")  # prefixes of channels that count as the speed
-_SILENT = (
-    "motor_current",
-    "wheel_torque_",
-    "brake_pressure_",
-)  # thrust and brakes say nothing of v that the speed does not
+# thrust and brakes say nothing of v that the speed does not
+_SILENT = ("motor_current", "wheel_torque_", "brake_pressure_")
 
 
 @dataclass(frozen=True)
@@ -553,7 +545,7 @@ def _axle_columns(drive: Drive, inputs: set[str], front: bool) -> FloatArray:
     u = drive.inputs["vx"]
     yaw_rate = drive.inputs["yaw_rate"]
     a = drive.inputs["ay"] if "ay" in inputs else u * yaw_rate
-    change = np.gradient(yaw_rate) * drive.rate_hz if len(u) > 1 else np.zeros_like(u)
+    change = derivative(yaw_rate, drive.rate_hz)
     return np.stack([yaw_rate, u * a, u * change, u * a**3, *([u] if front else [])], 1)
 
 

@@ -624,10 +624,12 @@ def accuracy(parts: Sequence[Scored]) -> dict[str, float]:
     """
     whole = Scored.joined(parts)
     error = np.degrees(whole.sideslip_error)
-    nonlinear = error[np.abs(whole.ay) >= NONLINEAR_AY]
-    scored = (
-        error[whole.is_sideslip_scored] if whole.is_sideslip_scored.any() else np.full(1, np.nan)
-    )
+
+    def errors_at(is_counted: BoolArray) -> FloatArray:
+        return error[is_counted] if is_counted.any() else np.full(1, np.nan)
+
+    nonlinear = errors_at(np.abs(whole.ay) >= NONLINEAR_AY)
+    scored = errors_at(whole.is_sideslip_scored)
     variance = float(np.var(whole.vy_ref))
     fvu = float(np.var(whole.vy_ref - whole.vy)) / variance if variance > 0 else math.nan
     return {
@@ -636,13 +638,9 @@ def accuracy(parts: Sequence[Scored]) -> dict[str, float]:
         "r2": 1.0 - fvu,
         "rmse_sideslip": rms(scored),
         "mse_sideslip": float(np.mean(np.square(error))),
-        "mse_sideslip_nonlinear": float(np.mean(np.square(nonlinear)))
-        if len(nonlinear)
-        else math.nan,
+        "mse_sideslip_nonlinear": float(np.mean(np.square(nonlinear))),
         "max_error_sideslip": float(np.abs(scored).max()),
-        "max_error_sideslip_nonlinear": float(np.abs(nonlinear).max())
-        if len(nonlinear)
-        else math.nan,
+        "max_error_sideslip_nonlinear": float(np.abs(nonlinear).max()),
         "p99_sideslip": float(np.quantile(np.abs(scored), 0.99)),
         "share_below_min_speed": float(1.0 - whole.is_sideslip_scored.mean()),
         **_state_accuracy(parts),

@@ -43,13 +43,8 @@ class Comparison:
     @property
     def reversed(self) -> Comparison:
         """The comparison with first and second swapped."""
-        verdict: Verdict = (
-            "higher"
-            if self.verdict == "lower"
-            else "lower"
-            if self.verdict == "higher"
-            else self.verdict
-        )
+        swapped: dict[Verdict, Verdict] = {"lower": "higher", "higher": "lower"}
+        verdict = swapped.get(self.verdict, self.verdict)
         return Comparison(-self.difference, -self.high, -self.low, self.p_value, verdict)
 
 
@@ -71,11 +66,8 @@ class Ranking:
     @property
     def missing_baselines(self) -> list[str]:
         """Those of `BASELINES` that were not compared."""
-        return [
-            baseline
-            for baseline in BASELINES
-            if not any(name[0] == baseline for name in self.order)
-        ]
+        compared = {name[0] for name in self.order}
+        return [baseline for baseline in BASELINES if baseline not in compared]
 
     def beats(self, name: Name, baseline: str) -> bool | None:
         """Whether a candidate's RMSE lies significantly below a baseline's; None without a

@@ -25,6 +25,7 @@ from scipy import signal
 
 from vehest.constants import FloatArray
 from vehest.data.recording import Recording
+from vehest.data.runs import filled
 from vehest.data.splits import Span
 from vehest.evaluation.metrics import Protocol, Scored, accuracy, scored_range
 
@@ -96,19 +97,6 @@ def slope(samples: FloatArray, rate_hz: float) -> FloatArray:
         return np.zeros_like(samples)
     return np.asarray(
         signal.savgol_filter(samples, window, 1, deriv=1, delta=1.0 / rate_hz), dtype=np.float64
-    )
-
-
-def filled(samples: FloatArray) -> FloatArray:
-    """Samples with straight lines over gaps (NaN); zeros where no sample is finite."""
-    is_finite = np.isfinite(samples)
-    if is_finite.all():
-        return samples
-    at = np.arange(len(samples))
-    return (
-        np.interp(at, at[is_finite], samples[is_finite])
-        if is_finite.any()
-        else np.zeros_like(samples)
     )
 
 

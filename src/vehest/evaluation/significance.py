@@ -40,8 +40,13 @@ class Interval:
 
     def at(self, confidence: float) -> tuple[float, float]:
         """Lower and upper end of the interval at another confidence than 95 %."""
-        half = float(scipy.special.stdtrit(self.dof, 0.5 + confidence / 2.0)) * self.error
-        return self.value - half, self.value + half
+        return _ends(self.value, self.error, self.dof, confidence)
+
+
+def _ends(value: float, error: float, dof: float, confidence: float) -> tuple[float, float]:
+    """Lower and upper end of the interval of a value by Student's distribution."""
+    half = float(scipy.special.stdtrit(dof, 0.5 + confidence / 2.0)) * error
+    return value - half, value + half
 
 
 def differences_of_blocks(
@@ -194,8 +199,7 @@ class Contrast:
 
     def interval(self, confidence: float = CONFIDENCE) -> tuple[float, float]:
         """Lower and upper end of the interval of ``value`` at a confidence."""
-        half = float(scipy.special.stdtrit(self.dof, 0.5 + confidence / 2.0)) * self.error
-        return self.value - half, self.value + half
+        return _ends(self.value, self.error, self.dof, confidence)
 
     @property
     def p_value(self) -> float:
@@ -442,11 +446,9 @@ def _interval(value: float, drawn: FloatArray, dof: float) -> Interval:
     of the values that were drawn.
     """
     error = float(np.std(drawn))
-    half = float(scipy.special.stdtrit(dof, 0.5 + CONFIDENCE / 2.0)) * error
     ratio = abs(value) / error if error > 0 else (np.inf if value else 0.0)
-    return Interval(
-        value, value - half, value + half, 2.0 * float(scipy.special.stdtr(dof, -ratio)), error, dof
-    )
+    p_value = 2.0 * float(scipy.special.stdtr(dof, -ratio))
+    return Interval(value, *_ends(value, error, dof, CONFIDENCE), p_value, error, dof)
 
 
 def _logarithmic(value: float, drawn: FloatArray, dof: float) -> Interval:

@@ -42,9 +42,8 @@ UNITS = {
 _CLOCK = 1e-6  # s, tolerance within which two times are equal
 
 Window = tuple[float, float]  # start and end of a fault on a recording's clock [s]
-Flags = tuple[
-    FloatArray, FloatArray
-]  # (K,) as the errors: half width of the 90 % band of β [rad], NaN for none; health 0, 1 or 2
+# (K,) as the errors: half width of the 90 % band of β [rad], NaN for none; health 0, 1 or 2
+Flags = tuple[FloatArray, FloatArray]
 
 
 def errors_under_fault(
@@ -125,15 +124,13 @@ def flags_under_fault(
     is_valid = np.concatenate(valid)
     finite_delays = [delay for delay in delays if math.isfinite(delay)]
     figures = {"coverage_90": float(is_inside.mean())} if len(is_inside) else {}
-    figures |= (
-        {"coverage_90_unflagged": float(is_inside[is_valid].mean())} if is_valid.any() else {}
-    )
-    figures |= {"detection_delay": float(np.mean(finite_delays))} if finite_delays else {}
+    if is_valid.any():
+        figures["coverage_90_unflagged"] = float(is_inside[is_valid].mean())
+    if finite_delays:
+        figures["detection_delay"] = float(np.mean(finite_delays))
     if delays:
-        figures |= {
-            "missed_detections": (len(delays) - len(finite_delays)) / len(delays),
-            "max_error_sideslip_undetected": max(undetected),
-        }
+        figures["missed_detections"] = (len(delays) - len(finite_delays)) / len(delays)
+        figures["max_error_sideslip_undetected"] = max(undetected)
     return figures
 
 

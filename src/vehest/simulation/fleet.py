@@ -22,12 +22,8 @@ from vehest.simulation.plant.parameters import (
     rear_tyre,
 )
 from vehest.simulation.plant.planar_car import PlanarCar, scaled_car
+from vehest.simulation.random_streams import FLEET, random_stream
 from vehest.simulation.sensors.levels import SensorLevel, SensorLevels
-
-# random stream of the fleet in a drive's seed; 0 to 3 are the driver's, the sensors', the surface's
-# and the manoeuvre's
-_STREAM = 4
-
 
 # lowest and highest scale
 Scales = Annotated[tuple[float, float], "a pair [lowest, highest] of scales"]
@@ -142,7 +138,7 @@ def varied_planar(car: PlanarCar, variations: Sequence[Variation], seed: int) ->
 
 def _drawn(variations: Sequence[Variation], seed: int) -> dict[str, list[float]]:
     """Scales that the seed draws for each parameter."""
-    generator = np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=(_STREAM, 0)))
+    generator = random_stream(seed, FLEET, 0)
     factors_of: dict[str, list[float]] = {}
     for variation in variations:
         factor = variation.drawn(generator)
@@ -201,9 +197,7 @@ class SensorVariation:
         """
         if not self.factors and self.roll_share is None:
             return levels
-        generator = np.random.default_rng(
-            np.random.SeedSequence(entropy=seed, spawn_key=(_STREAM, 1))
-        )
+        generator = random_stream(seed, FLEET, 1)
         changed: dict[str, Any] = {}
         for entry in fields(levels):
             level = getattr(levels, entry.name)

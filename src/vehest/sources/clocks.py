@@ -13,6 +13,7 @@ from typing import Literal
 
 import numpy as np
 
+from vehest.alignment.motion import rms
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError, number_of
 from vehest.data.limits import check_limit
@@ -285,9 +286,8 @@ class Clock:
     start_time: float  # time of the first tick [s]
     rate_hz: float  # rate of the ticks [Hz]
     n_samples: int  # number of ticks
-    stamps: FloatArray | None = (
-        None  # the file's own time stamps, where samples must be interpolated [s]
-    )
+    # the file's own time stamps, where samples must be interpolated [s]
+    stamps: FloatArray | None = None
 
     def ticks(self) -> FloatArray:
         """Times of the uniform clock [s]."""
@@ -320,11 +320,8 @@ class Clock:
             return samples
         elapsed = self.stamps - self.stamps[0]
         if gappy:
-            return on_nearest(
-                samples,
-                np.minimum(np.rint(elapsed * self.rate_hz), self.n_samples - 1),
-                self.n_samples,
-            )
+            ticks = np.minimum(np.rint(elapsed * self.rate_hz), self.n_samples - 1)
+            return on_nearest(samples, ticks, self.n_samples)
         return at_ticks(samples, elapsed, np.arange(self.n_samples) / self.rate_hz)
 
 
@@ -377,12 +374,8 @@ def uniform_clock(
     if policy == "uniform":
         nominal = plain_rate(1.0 / float(np.median(steps)), INTERPOLATED_TOLERANCE)
         deviation = MOST_STRETCH
-        times, rate, _ = uniform_times(
-            stamps,
-            nominal,
-            location,
-            fix="leave rows out by drop_rows or set dataset.clock=interpolate",
-        )
+        remedy = "leave rows out by drop_rows or set dataset.clock=interpolate"
+        times, rate, _ = uniform_times(stamps, nominal, location, fix=remedy)
         start = float(times[0])
     elif uneven := unevenness(stamps):
         raise DataError(f"{location}: {uneven}; {fix}")
@@ -415,9 +408,8 @@ def even_clock(blocks: Iterable[FloatArray]) -> Clock | None:
         steps = np.diff(block, prepend=before)
         block_step = float(block[-1] - block[0]) / max(len(block) - 1, 1)
         intervals += [float(steps.min(initial=math.inf)), float(steps.max(initial=0.0))]
-        deviation = float(
-            np.abs(block - block[0] - block_step * np.arange(len(block))).max()
-        )  # away from the block's own line
+        # away from the block's own line
+        deviation = float(np.abs(block - block[0] - block_step * np.arange(len(block))).max())
         lines.append((count, len(block) - 1, float(block[0]), block_step, deviation))
         count += len(block)
         before = block[-1:]
@@ -519,7 +511,7 @@ def uniform_times(
             f"{measured_rate_hz:.6g} Hz about "
             f"{stamps[edges[worst]]:.6g} s: samples are missing or the clock drifts; {fix}"
         )
-    return times, measured_rate_hz, float(np.sqrt(np.mean(np.square(late))))
+    return times, measured_rate_hz, rms(late)
 
 
 def _robust_line(number: FloatArray, stamps: FloatArray) -> tuple[float, float]:
@@ -597,21 +589,12 @@ def ticks_within(begin: float, end: float, rate_hz: float, location: str) -> Flo
         They would be fewer than two, or more than the limits allow.
     """
     n_samples = (end - begin) * rate_hz
-    check_limit(
-        "samples",
-        n_samples,
-        f"{location} would become {n_samples:.0f} samples from {begin:.6g} s to {end:.6g} s at "
-        f"{rate_hz:g} Hz",
-    )
-    ticks = (
-        np.arange(math.ceil(begin * rate_hz - SLACK), math.floor(end * rate_hz + SLACK) + 1)
-        / rate_hz
-    )
+    span = f"from {begin:.6g} s to {end:.6g} s at {rate_hz:g} Hz"
+    check_limit("samples", n_samples, f"{location} would become {n_samples:.0f} samples {span}")
+    first = math.ceil(begin * rate_hz - SLACK)
+    ticks = np.arange(first, math.floor(end * rate_hz + SLACK) + 1) / rate_hz
     if len(ticks) < 2:
-        raise DataError(
-            f"{location} would become fewer than two samples from {begin:.6g} s to {end:.6g} s at "
-            f"{rate_hz:g} Hz"
-        )
+        raise DataError(f"{location} would become fewer than two samples {span}")
     return ticks
 
 

@@ -68,9 +68,8 @@ class Outcome:
     """Result of the download or check of one file."""
 
     name: str  # name of the file
-    what: Literal[
-        "fetched", "matched", "recorded"
-    ]  # matched its known checksum; was there and its checksum is recorded on first sight
+    # matched its known checksum; was there and its checksum is recorded on first sight
+    what: Literal["fetched", "matched", "recorded"]
     sha256: str  # checksum of the file
     size: int  # bytes
 
@@ -157,16 +156,14 @@ class Download:
         downloader = partial(_download, report=partial(progress, name) if progress else None)
         pooch.get_logger().setLevel("WARNING")
         try:
-            complete = Path(
-                pooch.retrieve(
-                    address,
-                    self._expected(name),
-                    name,
-                    self.folder / UNDER_WAY,
-                    downloader=downloader,
-                )
+            complete = pooch.retrieve(
+                address,
+                self._expected(name),
+                name,
+                self.folder / UNDER_WAY,
+                downloader=downloader,
             )
-            checksum = sha256_of(complete)
+            checksum = sha256_of(Path(complete))
             _record(self.folder, name, checksum)
             os.replace(complete, path)
         except OSError as error:
@@ -280,17 +277,10 @@ def download_of(source: Source) -> Download:
             f"{location}: download.files must list the names of files, each once, not {list(files)}"
         )
     path = str(source.dataset.get("path") or "None")
-    folder = (
-        existing_folder(None, source.name)
-        if path.split("/")[0] in {"None", "null"}
-        else Path(path).expanduser()
-    )
-    return Download(
-        folder,
-        options.url,
-        files,
-        {name: digest.lower() for name, digest in (options.sha256 or {}).items()},
-    )
+    has_root = path.split("/")[0] not in {"None", "null"}
+    folder = Path(path).expanduser() if has_root else existing_folder(None, source.name)
+    sha256 = {name: digest.lower() for name, digest in (options.sha256 or {}).items()}
+    return Download(folder, options.url, files, sha256)
 
 
 def _read_checksums(folder: Path) -> dict[str, str]:

@@ -25,9 +25,8 @@ class SampleAndHold:
     """
 
     channels: Annotated[tuple[str, ...], "a list of channels"]  # names of the channels
-    updated: str | int | None = (
-        None  # column that changes with every new sample, such as a time stamp of the sensors' own
-    )
+    # column that changes with every new sample, such as a time stamp of the sensors' own
+    updated: str | int | None = None
     # time by which a sample first stands in a row later than it was taken [s], of all channels, or
     # by channel
     delay: float | dict[str, float] = 0.0
@@ -78,14 +77,11 @@ class SampleAndHold:
         DataError
             The channels change in fewer than two rows, or no tick lies between samples of all.
         """
-        markers = (
-            {column.column for column in columns.values()}
-            if self.updated is None
-            else {str(self.updated)}
-        )
-        rows = (
-            np.flatnonzero(np.any([np.diff(values[name]) != 0 for name in markers], axis=0)) + 1
-        )  # the first row's sample may be older
+        markers = {str(self.updated)}
+        if self.updated is None:
+            markers = {column.column for column in columns.values()}
+        is_new = np.any([np.diff(values[name]) != 0 for name in markers], axis=0)
+        rows = np.flatnonzero(is_new) + 1  # the first row's sample may be older
         if len(rows) < 2:
             raise DataError(
                 f"{location}: the held channels change in {len(rows)} rows; was their sensor "
@@ -111,11 +107,8 @@ class SampleAndHold:
                 f"{location}: no row lies between two samples of every held channel; are their "
                 "delays in seconds?"
             )
-        return (
-            interpolated,
-            slice(int(inside[0]), int(inside[-1]) + 1),
-            (len(rows) - 1) / float(times[-1] - times[0]),
-        )
+        rate_hz = (len(rows) - 1) / float(times[-1] - times[0])
+        return interpolated, slice(int(inside[0]), int(inside[-1]) + 1), rate_hz
 
 
 def sample_and_hold_from_config(

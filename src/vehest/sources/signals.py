@@ -49,13 +49,10 @@ FASTER = 1.05
 class SignalChannel(Column):
     """Declaration of a signal that becomes a channel."""
 
-    interpolation: Literal["linear", "hold"] = (
-        "linear"  # hold: for values that hold until the next one
-    )
-    max_gap: Positive | None = (
-        # longest time between two samples that is interpolated [s]; None for three median intervals
-        None
-    )
+    # hold: for values that hold until the next one
+    interpolation: Literal["linear", "hold"] = "linear"
+    # longest time between two samples that is interpolated [s]; None for three median intervals
+    max_gap: Positive | None = None
 
 
 @dataclass(frozen=True)
@@ -237,13 +234,9 @@ class SignalSource(FileSource):
         if self.options.file_units == "check":
             for name, signal in signals.items():
                 location = self._signal_name(name, signal, file)
-                require_unit(
-                    signal.unit,
-                    self.channels[name],
-                    channel(name).unit,
-                    location,
-                    "set file_units: ignore",
-                )
+                unit = channel(name).unit
+                fix = "set file_units: ignore"
+                require_unit(signal.unit, self.channels[name], unit, location, fix)
         stamps, ticks, rate_hz = self._clock(signals, file, run)
         about = {key: entry for key, entry in provenance.items() if key != MISSING}
         left_out = provenance.get(MISSING, {}) if run == [*self._runs_of(file)][-1] else {}

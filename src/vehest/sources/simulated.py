@@ -124,13 +124,12 @@ class SimulatedSource(Source):
         if self.declared_car is not None:
             return self.declared_car
         varied = {name for entry in self.options.vary or () for name in entry["parameters"]}
-        has_payload = any(drive.payload for drive in self.drives.values())
-        cars = [_car_values(vehicle, varied) for vehicle in self.vehicles.values()]
+        first, *others = (_car_values(vehicle, varied) for vehicle in self.vehicles.values())
         common = {
-            name: cars[0][name] if all(car[name] == cars[0][name] for car in cars) else None
-            for name in cars[0]
+            name: value if all(car[name] == value for car in others) else None
+            for name, value in first.items()
         }
-        if has_payload:
+        if any(drive.payload for drive in self.drives.values()):
             common |= {"mass": None, "cg_to_rear_axle": None}
         return CarValues(**common)
 
@@ -169,15 +168,10 @@ class SimulatedSource(Source):
         whatever other drives there are.
         """
         drive_seed = self.drives[drive_id].seed
-        return (
-            int(
-                np.random.SeedSequence(
-                    [self.options.seed, zlib.crc32(drive_id.encode())]
-                ).generate_state(1)[0]
-            )
-            if drive_seed is None
-            else drive_seed
-        )
+        if drive_seed is not None:
+            return drive_seed
+        sequence = np.random.SeedSequence([self.options.seed, zlib.crc32(drive_id.encode())])
+        return int(sequence.generate_state(1)[0])
 
     def _simulation(self, drive_id: str, variations: Sequence[Any]) -> partial[Recording]:
         """The call that simulates a drive; ``variations`` are those of the vehicle's parameters.
@@ -266,11 +260,9 @@ class SimulatedSource(Source):
                 f"{location}: the data set would have {n_drives} drives",
                 ConfigurationError,
             )
-            drive_ids = (
-                [name]
-                if entry.count is None
-                else [f"{name}_{number:03d}" for number in range(1, entry.count + 1)]
-            )
+            drive_ids = [name]
+            if entry.count is not None:
+                drive_ids = [f"{name}_{number:03d}" for number in range(1, entry.count + 1)]
             if doubled := [drive_id for drive_id in drive_ids if drive_id in drives]:
                 raise ConfigurationError(
                     f"{self.location}: two drives are called '{doubled[0]}', names must differ"
@@ -306,10 +298,8 @@ def _simulator_of(
                 f"vehicle '{vehicle.get('name')}' has no stability control; leave "
                 "stability_control out"
             )
-        return partial(
-            simulate_planar_drive,
-            car=varied_planar(planar_car_from_configuration(vehicle), variations, seed),
-        )
+        car = varied_planar(planar_car_from_configuration(vehicle), variations, seed)
+        return partial(simulate_planar_drive, car=car)
     parameters = varied(vehicle_from_configuration(vehicle), variations, seed)
     if payload:
         parameters = loaded(parameters, payload.mass, payload.forward, payload.up)

@@ -23,7 +23,7 @@ import pyarrow as pa
 import pyarrow.csv as pc
 
 from vehest.constants import FloatArray
-from vehest.data.errors import DataError, number_of, printable
+from vehest.data.errors import DataError, first_of, number_of, printable
 from vehest.data.files import regular_file
 from vehest.data.limits import check_limit, check_unpacked, current_limits
 from vehest.data.parquet import DAMAGE, number_batches, numbers_of, parquet_file, read_numbers
@@ -530,9 +530,7 @@ def require_memory(file: Path, layout: TextLayout) -> None:
 
 def listed(names: Sequence[str]) -> str:
     """Names for a message: the first twelve, printable and at most 60 characters each."""
-    return ", ".join(printable(name[:60]) for name in names[:12]) + (
-        ", …" if len(names) > 12 else ""
-    )
+    return first_of([printable(name[:60]) for name in names], 12)
 
 
 def _seconds(file: Path, name: str, cells: pa.ChunkedArray) -> FloatArray:

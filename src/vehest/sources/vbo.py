@@ -18,6 +18,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
+from vehest.alignment.motion import rms
 from vehest.constants import FloatArray
 from vehest.data.channels import channel
 from vehest.data.errors import DataError, printable
@@ -96,9 +97,8 @@ class Log:
     seconds: FloatArray  # clock time since midnight, going on past it [s], (T,)
     # column -> module of the logger that it comes from; only of columns that have one
     modules: Mapping[str, str]
-    offsets: Mapping[
-        str, tuple[float, float]
-    ]  # point, such as FL -> lateral and longitudinal distance from the antenna [m]
+    # point, such as FL -> lateral and longitudinal distance from the antenna [m]
+    offsets: Mapping[str, tuple[float, float]]
     provenance: Mapping[str, Any]  # first line, offsets, and numbers of rows that were left out
 
 
@@ -206,13 +206,12 @@ def read_log(file: Path) -> Log:
     seconds = _seconds(columns.pop("time"), file)
     columns = _without_lost_fixes(columns)
     late = len(seconds) > 2 and bool(seconds[-1] - seconds[-2] > JUMP * np.median(np.diff(seconds)))
-    if late:
-        columns = {name: samples[:-1] for name, samples in columns.items()}
-        seconds = seconds[:-1]
     is_repeated = np.r_[False, np.diff(seconds) == 0.0]
-    if is_repeated.any():
-        columns = {name: samples[~is_repeated] for name, samples in columns.items()}
-        seconds = seconds[~is_repeated]
+    is_used = ~is_repeated
+    is_used[-1] &= not late
+    if not is_used.all():
+        columns = {name: samples[is_used] for name, samples in columns.items()}
+        seconds = seconds[is_used]
 
     units, modules = (
         _of_last_columns(names, sections.get(title, ""))
@@ -223,9 +222,9 @@ def read_log(file: Path) -> Log:
         for vertical, written in SPEED_IN_HEADER.findall(sections.get("header", ""))
         if (unit := plain_unit(written)) is not None
     }
-    entered = OFFSETS.findall(sections.get("comments", ""))
     offsets = {
-        point: (float(lateral), float(longitudinal)) for point, lateral, longitudinal in entered
+        point: (float(lateral), float(longitudinal))
+        for point, lateral, longitudinal in OFFSETS.findall(sections.get("comments", ""))
     }
     provenance = {
         "created": printable(" ".join(first.partition("\n")[0].split()))[:80],
@@ -270,11 +269,9 @@ def _of_last_columns(names: Sequence[str], section: str) -> dict[str, str]:
     lines = [line.strip() for line in section.splitlines()[1:]]
     while lines and not lines[-1]:
         lines.pop()
-    return (
-        dict(zip(names[len(names) - len(lines) :], lines, strict=True))
-        if len(lines) <= len(names)
-        else {}
-    )
+    if len(lines) > len(names):
+        return {}
+    return dict(zip(names[len(names) - len(lines) :], lines, strict=True))
 
 
 def require_slip_offsets(log: Log, location: str) -> None:
@@ -308,10 +305,8 @@ def require_slip_offsets(log: Log, location: str) -> None:
     if turns.sum() < MIN_TURNING_SAMPLES:
         return
     axle_distance = abs(log.offsets["FL"][1] - log.offsets["RL"][1])
-    expected = float(
-        np.sqrt(np.mean(np.square(np.degrees(axle_distance * yaw_rate[turns] / speed[turns]))))
-    )
-    measured = float(np.sqrt(np.mean(np.square(front[turns] - rear[turns]))))
+    expected = rms(np.degrees(axle_distance * yaw_rate[turns] / speed[turns]))
+    measured = rms(front[turns] - rear[turns])
     if measured < MIN_DIFFERENCE_SHARE * expected:
         raise DataError(
             f"{location}: slip at the front and the rear left wheel differs by {measured:.2g}° "

@@ -97,15 +97,8 @@ def fit_autoregression(pieces: Sequence[FloatArray], max_order: int = 10) -> Aut
         left = _least_squares(regressors[is_regular], targets[is_regular], max_order * n_channels)
         residual = targets - left[0] - regressors @ left[1:]
         robust = 1.4826 * np.median(np.abs(residual), axis=0) + MIN_DEVIATION
-        robust = np.maximum(
-            robust,
-            0.2
-            * np.sqrt(
-                np.mean(
-                    np.square(np.clip(residual, *np.percentile(residual, [0.5, 99.5], axis=0))), 0
-                )
-            ),
-        )
+        clipped = np.clip(residual, *np.percentile(residual, [0.5, 99.5], axis=0))
+        robust = np.maximum(robust, 0.2 * np.sqrt(np.mean(np.square(clipped), 0)))
         odd = (np.abs(residual) > OUTLIER * robust).any(1)
         is_regular = ~odd if odd.mean() < 0.02 else is_regular
     chosen = left

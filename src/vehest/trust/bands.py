@@ -42,6 +42,7 @@ from vehest.data.estimate import Estimate
 from vehest.data.recording import UNNAMED_VEHICLE, Recording
 from vehest.estimators.kernels.compiling import entry
 from vehest.trust.checks import check_channels, check_number, check_numbers
+from vehest.trust.guard import columns_of
 from vehest.trust.tyre_check import TyreCheck
 
 LEVELS = (0.5, 0.68, 0.9, 0.95)  # coverages, for each of which a band has a factor
@@ -170,21 +171,13 @@ class Bands:
         """
         level_place = LEVELS.index(CHANNEL_LEVEL)
         wider = OTHER_VEHICLE if elsewhere else 1.0
-        head = [
-            self.vy.factors[level_place] * wider,
-            self.sideslip.factors[level_place] * wider,
-            self.vy.floor**2,
-            self.sideslip.floor**2,
-        ]
-        weights = [
-            quantity.weights.get(name, 0.0)
-            for quantity in (self.vy, self.sideslip)
-            for name in TERMS
-        ]
-        tyre_weights = (0.0, 0.0) if self.tyre_check is None else self.tyre_check.weights
-        head += [LOWEST_SPEED, *tyre_weights]
-        numbers = np.array([*head, *weights, *(self.largest.get(name, 0.0) for name in TERMS)])
-        return PackedBands(_columns(self.channels), numbers)
+        quantities = (self.vy, self.sideslip)
+        numbers = [quantity.factors[level_place] * wider for quantity in quantities]
+        numbers += [quantity.floor**2 for quantity in quantities]
+        numbers += [LOWEST_SPEED, *(self.tyre_check.weights if self.tyre_check else (0.0, 0.0))]
+        for by_term in (*(quantity.weights for quantity in quantities), self.largest):
+            numbers += [by_term.get(name, 0.0) for name in TERMS]
+        return PackedBands(np.array(columns_of(COLUMNS, self.channels)), np.array(numbers))
 
     def half_widths(
         self,
@@ -362,13 +355,6 @@ def tyre_error_of(check: TyreCheck | None, estimate: Estimate) -> FloatArray:
     return check.squared_errors(estimate["vx"], estimate["friction"])
 
 
-def _columns(channels: Sequence[str]) -> NDArray[np.int64]:
-    """Index of each of `COLUMNS` among the channels, -1 where it is not there, (5,)."""
-    return np.array(
-        [channels.index(name) if name in channels else -1 for name in COLUMNS], dtype=np.int64
-    )
-
-
 # Calibration
 
 
@@ -421,7 +407,7 @@ def calibrated(
                 f"no sample of the {role} ranges has both an estimate and a reference to "
                 "calibrate bands by"
             )
-    columns = _columns(channels)
+    columns = np.array(columns_of(COLUMNS, channels))
     terms = np.concatenate(
         [
             terms_of(piece.rows, piece.vy, piece.variance, columns)[piece.has_error]
@@ -475,10 +461,8 @@ def calibrated(
     )
     scores = _scores(bands, validation)
     if bands.tyre_check is not None:
-        unchecked = (pooled_quantile(score, blocks, CHANNEL_LEVEL)[0] for score in scores.T)
-        vy_factor, sideslip_factor = unchecked
-        check = bands.tyre_check.scaled_by((vy_factor, sideslip_factor))
-        bands = replace(bands, tyre_check=check)
+        factors = [pooled_quantile(score, blocks, CHANNEL_LEVEL)[0] for score in scores.T]
+        bands = replace(bands, tyre_check=bands.tyre_check.scaled_by(factors))
         scores = _scores(bands, validation)
     vy, sideslip = (
         _with_factors(scale, score, blocks) for scale, score in zip(scales, scores.T, strict=True)
@@ -517,10 +501,8 @@ def _with_factors(scale: Quantity, scores: FloatArray, blocks: NDArray[np.int64]
     factors, is_beyond = zip(
         *(pooled_quantile(scores, blocks, level) for level in LEVELS), strict=True
     )
-    squared = np.asarray(
-        np.bincount(np.unique(blocks, return_inverse=True)[1], weights=np.square(scores)),
-        dtype=np.float64,
-    )
+    places = np.unique(blocks, return_inverse=True)[1]
+    squared = np.bincount(places, weights=np.square(scores)).astype(np.float64)
     return replace(
         scale, factors=factors, beyond=is_beyond, effective_blocks=effective_blocks(squared)
     )

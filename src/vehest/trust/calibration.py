@@ -69,26 +69,20 @@ def learn_trust(
     guard = None
     health = None
     notes = []
+    cars = dict.fromkeys(stretch.recording.car for stretch in validation)
+    cars.pop(UNKNOWN_CAR, None)
     try:
         bands = calibrated(
             pieces_of(estimator, train),
             pieces_of(estimator, validation),
             tuple(estimator.channels),
             vehicles=tuple(dict.fromkeys(stretch.recording.vehicle for stretch in validation)),
-            datasets=tuple(
-                dict.fromkeys(stretch.dataset for stretch in validation if stretch.dataset)
-            ),
+            datasets=tuple(dict.fromkeys(filter(None, (part.dataset for part in validation)))),
             scaled_on=tuple(stretch.name for stretch in train),
             calibrated_on=tuple(stretch.name for stretch in validation),
             horizon_steps=estimator.horizon_steps,
             tyre_check=tyre_check_of(estimator),
-            cars=tuple(
-                dict.fromkeys(
-                    stretch.recording.car
-                    for stretch in validation
-                    if stretch.recording.car != UNKNOWN_CAR
-                )
-            ),
+            cars=tuple(cars),
         )
     except DataError as error:  # such as a missing reference, which does not prevent an evaluation
         notes.append(str(error))

@@ -49,6 +49,7 @@ from vehest.trust.guard import (
     Cleaned,
     Guard,
     GuardLimits,
+    columns_of,
     usual_limits,
 )
 from vehest.trust.health import INVALID, Health
@@ -68,8 +69,9 @@ def limits_for(estimator: Estimator, trust: Trust | None) -> GuardLimits:
     """
     if trust is not None:
         trust.check_fit(estimator)
-    learnt_limits = trust.guard if trust is not None else None
-    return learnt_limits or usual_limits(estimator.channels, estimator.settings.rate_hz)
+        if trust.guard is not None:
+            return trust.guard
+    return usual_limits(estimator.channels, estimator.settings.rate_hz)
 
 
 class GuardedRun:
@@ -187,13 +189,10 @@ class GuardedRun:
         leaves; returns the end of the rows that were judged, and whether the estimator was lost
         there.
         """
-        motion = self.motion[start:end]
-        motion = np.where(
-            np.isnan(motion),
-            np.stack([self.vx[start:end], motion[:, 1], motion[:, 2]], axis=1),
-            motion,
-        )
-        watched = self.watch(raw, np.ascontiguousarray(motion), self.cleaned.flow[start:end])
+        motion = self.motion[start:end].copy()
+        is_unknown = np.isnan(motion[:, 0])
+        motion[is_unknown, 0] = self.vx[start:end][is_unknown]
+        watched = self.watch(raw, motion, self.cleaned.flow[start:end])
         done = start + len(watched.vy)
         self.out[start:done] = watched.vy
         self.marks[start:done] = watched.marks
@@ -209,21 +208,14 @@ class GuardedRun:
         extra = self.estimator.horizon_steps
         rows = np.concatenate([window, self.cleaned.rows[start:end]])
         self._window = rows[max(len(rows) - self.estimator.warm_up_steps, 0) :]
-        channels = dict(
-            zip(
-                self.estimator.channels,
-                np.concatenate([rows, np.repeat(rows[-1:], extra, axis=0)]).T,
-                strict=True,
-            )
-        )
+        columns = np.concatenate([rows, np.repeat(rows[-1:], extra, axis=0)]).T
         r = self.recording
-        rate = self.estimator.settings.rate_hz
         piece = Recording(
             r.id,
             r.vehicle,
-            rate,
+            self.estimator.settings.rate_hz,
             r.start_time,
-            channels,
+            dict(zip(self.estimator.channels, columns, strict=True)),
             r.kind,
             frozenset(self.estimator.skippable),
         )
@@ -297,19 +289,14 @@ class GuardedRun:
             "vy": vy,
             "sideslip": np.where(np.hypot(vx, vy) < STANDSTILL_SPEED, 0.0, np.arctan2(vy, vx)),
         }
-        channels |= {name: later(name, values) for name, values in self.extra_quantities.items()}
+        further = dict(self.extra_quantities)
         if monitor.has_bands:
-            channels |= {
-                "band_vy": later("band_vy", bands[:, 0]),
-                "band_sideslip": later("band_sideslip", bands[:, 1]),
-            }
+            further |= {"band_vy": bands[:, 0], "band_sideslip": bands[:, 1]}
+        channels |= {name: later(name, values) for name, values in further.items()}
         channels |= {"health": verdict.status, "health_reason": verdict.reason}
         mode: Mode = "causal" if self.estimator.causal else "offline"
-        covariance = (
-            (self.covariance, self.covariance_of)
-            if self.covariance is not None and horizon == 0
-            else (None, ())
-        )
+        has_covariance = self.covariance is not None and horizon == 0
+        covariance = (self.covariance, self.covariance_of) if has_covariance else (None, ())
         return Estimate(
             r.id,
             self.estimator.name,
@@ -347,9 +334,8 @@ def motion_of(channels: Sequence[str], cleaned: Cleaned) -> FloatArray:
         not measured while the estimator waits.
     """
     motion = np.full((len(cleaned.rows), len(MOTION_CHANNELS)), np.nan)
-    for column, name in enumerate(MOTION_CHANNELS):
-        if name in channels:
-            at = channels.index(name)
+    for column, at in enumerate(columns_of(MOTION_CHANNELS, channels)):
+        if at >= 0:
             motion[:, column] = np.where(
                 cleaned.measured[:, at] | (cleaned.flow != WAIT), cleaned.rows[:, at], np.nan
             )
@@ -412,10 +398,7 @@ class GuardedStepper(Stepper):
         self._vx = np.full(1, np.nan)
         self._variance = np.full(1, np.nan)
         self._tyre_error = np.zeros(1)
-        self._places = [
-            estimator.channels.index(name) if name in estimator.channels else -1
-            for name in MOTION_CHANNELS
-        ]
+        self._places = columns_of(MOTION_CHANNELS, estimator.channels)
         self.clock = SampleClock(self.input_rate_hz) if clock is None else clock
         self._judges_samples = clock is None
         self._extra_quantities: dict[str, float] = {}

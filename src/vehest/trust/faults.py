@@ -188,19 +188,16 @@ def size_of(kind: str, channel: str, severity: Severity) -> float:
     channel_range = CHANNELS[channel]
     at = SEVERITIES.index(severity)
     sizes = KINDS[kind].sizes
+    is_speed = _is_angular_speed(channel)
     if sizes is None:
-        return (WHEEL_FACTORS if _is_angular_speed(channel) else UNIT_FACTORS[channel_range.unit])[
-            at
-        ]
+        return (WHEEL_FACTORS if is_speed else UNIT_FACTORS[channel_range.unit])[at]
     if isinstance(sizes, tuple):
         return sizes[at]
     if channel in OFFSETS:
         return sizes * OFFSETS[channel][at]
-    return sizes * (
-        OFFSETS_OF_SPEED[at]
-        if _is_angular_speed(channel)
-        else OFFSETS_OF_RANGE[at] * _range(channel_range)
-    )
+    if is_speed:
+        return sizes * OFFSETS_OF_SPEED[at]
+    return sizes * (OFFSETS_OF_RANGE[at] * _range(channel_range))
 
 
 def inject(
@@ -305,9 +302,8 @@ class FaultedChannel:
         at least.
         """
         is_chosen = np.zeros(len(self.inside) if number is None else number, np.bool_)
-        is_chosen[
-            self.random.permutation(len(is_chosen))[: max(round(share * len(is_chosen)), 1)]
-        ] = True
+        order = self.random.permutation(len(is_chosen))
+        is_chosen[order[: max(round(share * len(is_chosen)), 1)]] = True
         return is_chosen
 
     def pieces(self) -> NDArray[np.bool_]:
@@ -315,9 +311,8 @@ class FaultedChannel:
         chosen share of the pieces is ``size``.
         """
         length = max(round(PIECE_SECONDS * self.rate_hz), 1)
-        return np.repeat(self.drawn(self.size, math.ceil(len(self.inside) / length)), length)[
-            : len(self.inside)
-        ]
+        drawn = self.drawn(self.size, math.ceil(len(self.inside) / length))
+        return np.repeat(drawn, length)[: len(self.inside)]
 
     def earlier(self, samples: int) -> FloatArray:
         """Values that the channel had ``samples`` samples earlier, (end - first,); its first value

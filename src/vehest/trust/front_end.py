@@ -18,6 +18,7 @@ import scipy
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError
 from vehest.data.recording import HIGHEST_RATE
+from vehest.data.runs import filled
 from vehest.estimators.kernels.compiling import entry
 from vehest.trust.guard import WAIT, Guard, GuardLimits, usual_limits
 
@@ -51,15 +52,7 @@ def behind_front_end(samples: FloatArray, rate_hz: float) -> FloatArray:
         (T, C) at the model's rate. The noise is drawn from a fixed seed, so that limits that are
         learnt from it are reproducible.
     """
-    at = np.arange(len(samples))
-    measured_columns = [np.isfinite(column) for column in samples.T]
-    full = [
-        np.interp(at, at[is_measured], column[is_measured])
-        if is_measured.any()
-        else np.zeros(len(at))
-        for is_measured, column in zip(measured_columns, samples.T, strict=True)
-    ]
-    together = np.stack(full, axis=1)
+    together = np.stack([filled(column) for column in samples.T], axis=1)
     fast = scipy.signal.resample_poly(together, TYPICAL_RATE_RATIO, 1, axis=0, padtype="line")
     band = scipy.signal.butter(2, NOISE_BAND, btype="bandpass", fs=1.0, output="sos")
     density = scipy.signal.sosfilt(band, together - together.mean(axis=0), axis=0).var(axis=0) / (

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
+from vehest.data.derived import speed_of_reference
 from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 from vehest.data.runs import true_runs
@@ -82,10 +83,7 @@ class ChannelLimits:
     jump: Annotated[float, "a positive number"]  # largest change from one sample to the next [unit]
     run: float = 0.0  # longest time that it may stand still while the car moves [s]; 0 if any
     # between which alone it is expected to move [unit]
-    stops: tuple[float, float] = (
-        -ENDLESS,
-        ENDLESS,
-    )
+    stops: tuple[float, float] = (-ENDLESS, ENDLESS)
 
     def __post_init__(self) -> None:
         """Raise `DataError` for limits in the wrong order or out of range."""
@@ -120,6 +118,11 @@ class GuardLimits:
                 )
         check_number("guard.top_speed", self.top_speed, math.ulp(0.0), MAX_TOP_SPEED)
         check_number("guard.largest_tan_sideslip", self.largest_tan_sideslip, 1.0, MAX_TAN_SIDESLIP)
+
+
+def columns_of(names: Sequence[str], channels: Sequence[str]) -> list[int]:
+    """Index of each name among the channels, -1 where it is not there."""
+    return [channels.index(name) if name in channels else -1 for name in names]
 
 
 def usual_limits(channels: Sequence[str], rate_hz: float) -> GuardLimits:
@@ -164,14 +167,12 @@ def learn_limits(
             run=_run_limit(having, name, stops),
             stops=stops,
         )
-    top = _largest(
-        [
-            recording[name]
-            for recording in recordings
-            for name in ("vx", "vx_ref")
-            if name in recording
-        ]
-    )
+    speeds = [
+        recording.channels[name]
+        for recording in recordings
+        for name in recording.channels.keys() & {"vx", "vx_ref"}
+    ]
+    top = _largest(speeds)
     tangents = _largest([_tan_sideslip(recording) for recording in recordings])
     return GuardLimits(
         channel_limits,
@@ -204,17 +205,15 @@ def _fastest(name: str, rate_hz: float) -> float:
     """Largest change of a channel from one sample to the next that a car reaches, in its unit."""
     table = CHANNELS[name]
     span = table.high - table.low
-    return (
-        span
-        if name.startswith(CAR_DEPENDENT_PREFIXES)
-        else CAR_LIMITS.get(table.unit, (0.0, span, 0.0))[1] / rate_hz
-    )
+    if name.startswith(CAR_DEPENDENT_PREFIXES):
+        return span
+    return CAR_LIMITS.get(table.unit, (0.0, span, 0.0))[1] / rate_hz
 
 
 def _tan_sideslip(recording: Recording) -> FloatArray:
     """|v|/max(|u|, 1 m/s) of a recording's references; empty where it has none."""
-    name = "vx_ref" if "vx_ref" in recording else "vx"
-    if not ("vy_ref" in recording and name in recording):
+    name = speed_of_reference(recording)
+    if not {"vy_ref", name} <= recording.channels.keys():
         return np.zeros(0)
     return np.abs(recording["vy_ref"]) / np.maximum(np.abs(recording[name]), 1.0)
 
@@ -257,15 +256,12 @@ def stops_of(parts: Sequence[FloatArray], name: str) -> tuple[float, float]:
     if name in STEERING and any(np.isfinite(part).any() for part in parts):
         for side, sign in enumerate((-1.0, 1.0)):
             farthest = max(float(np.nanmax(sign * part, initial=-ENDLESS)) for part in parts)
-            repeats = [np.abs(np.diff(part)) <= STOP_TOLERANCE * farthest for part in parts]
-            # samples that equal the two before them
-            stayed = [
-                sign * part[2:][is_repeated[1:] & is_repeated[:-1]]
-                for part, is_repeated in zip(parts, repeats, strict=True)
-            ]
-            reached = [
-                value for values in stayed for value in values if value >= NEAR_STOP * farthest
-            ]
+            reached: list[float] = []
+            for part in parts:
+                is_repeated = np.abs(np.diff(part)) <= STOP_TOLERANCE * farthest
+                # samples that equal the two before them
+                stayed = sign * part[2:][is_repeated[1:] & is_repeated[:-1]]
+                reached += stayed[stayed >= NEAR_STOP * farthest].tolist()
             if farthest > 0 and reached:
                 stops[side] = sign * (float(np.median(reached)) - STOP_TOLERANCE * farthest)
     return stops[0], stops[1]
@@ -327,7 +323,7 @@ class Guard:
             ]
         )
         self._skippable = np.array([name in skippable for name in channels])
-        places = [channels.index(name) if name in channels else -1 for name in ("vx", "yaw_rate")]
+        places = columns_of(("vx", "yaw_rate"), channels)
         self.bridged_samples = max(round(BRIDGED_SECONDS * rate_hz), 1)
         self.persistent_samples = max(round(PERSISTS_SECONDS * rate_hz), 2)
         self._settings = np.array(

@@ -36,7 +36,7 @@ from vehest.trust.autoregression import Autoregression, fit_autoregression, lear
 from vehest.trust.checks import check_channels, check_number, check_numbers, check_shape
 from vehest.trust.clock import CLOCK_JUMPED, CLOCK_STOPPED, CLOCK_UNEVEN
 from vehest.trust.front_end import behind_front_end
-from vehest.trust.guard import ENDLESS, longest_run, stops_of
+from vehest.trust.guard import ENDLESS, columns_of, longest_run, stops_of
 from vehest.trust.health_kernel import N_LEVELS, Layout, Model, State, health_kernel
 from vehest.trust.named_arrays import allocated, views
 from vehest.trust.relations import (
@@ -228,16 +228,21 @@ class HealthModel:
         """Raise `DataError` unless everything has the length that the kernel's arrays have."""
         check_channels("health.channels", self.channels)
         channels = len(self.channels)
-        for name in ("constant", "deviation", "usual", "largest", "longest_gap"):
-            check_shape(f"health.{name}", getattr(self, name), channels)
-        check_number("health: the order of coefficients", len(self.coefficients), 1, MAX_ORDER)
         order = len(self.coefficients)
-        check_shape("health.coefficients", self.coefficients, order, channels, channels)
-        check_shape("health.precision", self.precision, channels, channels)
-        check_shape("health.speeds", self.speeds, N_LEVELS)
-        check_shape("health.levels", self.levels, N_LEVELS, channels)
-        for name in ("healthy", "heaviest"):
-            check_shape(f"health.{name}", getattr(self, name), len(getattr(self, name)), channels)
+        check_number("health: the order of coefficients", order, 1, MAX_ORDER)
+        shapes = {
+            **dict.fromkeys(
+                ("constant", "deviation", "usual", "largest", "longest_gap"), (channels,)
+            ),
+            "coefficients": (order, channels, channels),
+            "precision": (channels, channels),
+            "speeds": (N_LEVELS,),
+            "levels": (N_LEVELS, channels),
+            "healthy": (len(self.healthy), channels),
+            "heaviest": (len(self.heaviest), channels),
+        }
+        for name, shape in shapes.items():
+            check_shape(f"health.{name}", getattr(self, name), *shape)
         if self.stops and len(self.stops) != channels:
             raise DataError(f"health.stops has {len(self.stops)} entries, not {channels}")
         allowed = relations_among(self.channels)
@@ -260,9 +265,8 @@ class HealthModel:
     def _check_ranges(self) -> None:
         """Raise `DataError` unless numbers are in ranges that training can produce."""
         check_number("health.rate_hz", self.rate_hz, math.ulp(0.0), HIGHEST_RATE)
-        for name in ("deviation", "largest", "longest_gap", "spin", "speeds"):
+        for name in ("deviation", "largest", "longest_gap", "spin", "speeds", "standstill"):
             check_numbers(f"health.{name}", getattr(self, name), 0.0)
-        check_numbers("health.standstill", self.standstill, 0.0)
         check_number("health.standstill", self.standstill[0], math.ulp(0.0))
         for row in self.levels:
             check_numbers("health.levels", row, math.ulp(0.0))
@@ -278,11 +282,8 @@ class HealthModel:
     @property
     def layout(self) -> Layout:
         """Sizes, columns of channels and numbers of rows that the kernel needs."""
-        names = list(self.channels)
-        columns = [
-            names.index(name) if name in names else -1
-            for name in ("yaw_rate", speed_channel(names) or "", "ay", "ax")
-        ]
+        names = self.channels
+        columns = columns_of(("yaw_rate", speed_channel(names) or "", "ay", "ax"), names)
         rows = [
             max(round(seconds * self.rate_hz), 1)
             for seconds in (HOLD_SECONDS, BRIDGED_SECONDS, SPIN_SECONDS)
@@ -534,9 +535,9 @@ def learn_health(
     turning = (
         joined[speed] * joined["yaw_rate"] if speed and "yaw_rate" in names else np.full(1, np.inf)
     )
-    standstill_limits = [
+    yaw_rate_limit, ay_limit = (
         min(size, 0.1 * largest.get(name, np.inf)) for name, size in STANDSTILL_LIMITS.items()
-    ]
+    )
     health = HealthModel(
         channels=names,
         rate_hz=float(rate_hz),
@@ -551,7 +552,7 @@ def learn_health(
             max((longest_run(np.isnan(part[name])) for part in received), default=0) / rate_hz
             for name in names
         ),
-        standstill=(least_speed, standstill_limits[0], standstill_limits[1]),
+        standstill=(least_speed, yaw_rate_limit, ay_limit),
         spin=(
             SPIN_MARGIN * largest.get("yaw_rate", 1e9),
             min(SPIN_MARGIN * float(np.nanmax(np.abs(turning))), 1e9),
@@ -561,20 +562,13 @@ def learn_health(
         stops=tuple(stops_of([recording[name] for recording in train], name) for name in names),
     )
     health = _with_healthy(_with_healthy(health, train), train)
-    filtered = [
-        replace(
-            recording,
-            channels=dict(
-                zip(
-                    names,
-                    behind_front_end(recording.stack(names), recording.rate_hz).T,
-                    strict=True,
-                )
-            ),
-        )
-        for recording in (*train, *validation)
-    ]
-    plain, behind = (block_maxima(health, drives) for drives in ([*train, *validation], filtered))
+    drives = [*train, *validation]
+    filtered = []
+    for recording in drives:
+        columns = behind_front_end(recording.stack(names), recording.rate_hz).T
+        filtered.append(replace(recording, channels=dict(zip(names, columns, strict=True))))
+    plain = block_maxima(health, drives)
+    behind = block_maxima(health, filtered)
     statistics = health.statistics
     step = 1.0 / rate_hz
     limits = limits_from(plain, statistics, step)
@@ -717,12 +711,10 @@ def limits_from(
             limit = min(max(top + 0.15, MIN_REPEATED_SHARE), 0.5 * (1.0 + min(top, 1.0)))
         elif statistic.rule == "domain":
             limit = DAY_TO_DAY_FACTOR
+        elif statistic.rule == "run":
+            limit = max(limit + 2.0, MIN_RUN_SAMPLES)
         else:
-            limit = (
-                max(limit + 2.0, MIN_RUN_SAMPLES)
-                if statistic.rule == "run"
-                else max(limit, MIN_LIMITS[statistic.rule])
-            )
+            limit = max(limit, MIN_LIMITS[statistic.rule])
         limits.append(
             limit if limit > 0.0 and not (statistic.rule == "share" and top >= 1.0) else 1e300
         )
@@ -748,17 +740,8 @@ def outside_domain(model: HealthModel, samples: Mapping[str, FloatArray]) -> NDA
         np.abs(np.nan_to_num(np.asarray(samples[name], dtype=np.float64), posinf=0.0, neginf=0.0))
         for name in model.channels
     ]
-    outside = [
-        size > DAY_TO_DAY_FACTOR * largest
-        for size, largest in zip(sizes, model.largest, strict=True)
-    ]
-    return np.array(
-        [
-            *(is_outside.sum() for is_outside in outside),
-            np.any(outside, axis=0).sum(),
-            len(sizes[0]),
-        ]
-    )
+    outside = np.stack(sizes) > DAY_TO_DAY_FACTOR * np.array(model.largest)[:, None]
+    return np.array([*outside.sum(axis=1), outside.any(axis=0).sum(), len(sizes[0])])
 
 
 def domain_verdict(model: HealthModel, counts: NDArray[np.int64]) -> str:

@@ -44,19 +44,19 @@ class Trust:
 
     def check_fit(self, estimator: Estimator) -> None:
         """Raise `DataError` unless family, channels, rate and horizon are those of an estimator."""
-        expected = (estimator.name, tuple(estimator.channels), estimator.settings.rate_hz)
+        channels = tuple(estimator.channels)
         differences: list[tuple[str, object, object]] = [
-            ("about.estimator", current_name(self.about.estimator), expected[0])
+            ("about.estimator", current_name(self.about.estimator), estimator.name)
         ]
         if self.bands is not None:
             differences += [
-                ("bands.channels", self.bands.channels, expected[1]),
+                ("bands.channels", self.bands.channels, channels),
                 ("bands.horizon_steps", self.bands.horizon_steps, estimator.horizon_steps),
             ]
         if self.health is not None:
             differences += [
-                ("health.channels", self.health.channels, expected[1]),
-                ("health.rate_hz", self.health.rate_hz, expected[2]),
+                ("health.channels", self.health.channels, channels),
+                ("health.rate_hz", self.health.rate_hz, estimator.settings.rate_hz),
             ]
         for name, value, expected_value in differences:
             if value != expected_value:
@@ -74,11 +74,9 @@ class Trust:
         a channel that is not read as not measured.
         """
         channels = tuple(estimator.channels)
+        expected = (channels, estimator.settings.rate_hz)
         health = self.health
-        if health is not None and (health.channels, health.rate_hz) != (
-            channels,
-            estimator.settings.rate_hz,
-        ):
+        if health is not None and (health.channels, health.rate_hz) != expected:
             health = None
         bands = self.bands
         if bands is not None:
@@ -167,10 +165,9 @@ def write_trust(trust: Trust, folder: Path, model: str = "") -> None:
     """
     content = json.loads(json.dumps({"format": FORMAT, **asdict(trust)}))  # tuples as lists
     del content["about"]["model"]
-    if content["bands"] and not content["bands"]["cars"]:
-        del content["bands"]["cars"]
-    if content["bands"] and not content["bands"]["tyre_check"]:
-        del content["bands"]["tyre_check"]
+    for name in ("cars", "tyre_check") if content["bands"] else ():
+        if not content["bands"][name]:
+            del content["bands"][name]
     content["about"] |= {"model": model} if model else {}
     (folder / TRUST).write_text(
         yaml.safe_dump(content, sort_keys=False, allow_unicode=True), encoding="utf-8"

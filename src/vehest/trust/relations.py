@@ -20,6 +20,7 @@ function.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -63,28 +64,7 @@ RATE = "du/dt"  # term that is a rate of change, and no feature of one sample
 SIDESLIP_DRAG = "v r"  # feature: ax by the lateral velocity in a turn
 DRAG = ("r²", "u²", SIDESLIP_DRAG)  # small features of ax, which say nothing of its sign and unit
 # term -> symbols of the quantities in it
-_SYMBOLS = dict(
-    zip(
-        FEATURES,
-        (
-            "",
-            "r",
-            "u",
-            ("u", "r"),
-            ("u", "r"),
-            ("r", "u"),
-            ("ay",),
-            ("ay", "u"),
-            ("ay",),
-            "r",
-            "u",
-            ("ax",),
-            "r",
-        ),
-        strict=True,
-    )
-)
-_SYMBOLS[RATE] = "u"
+_SYMBOLS = {name: re.findall("[ru]|ay|ax", name) for name in FEATURES} | {RATE: ["u"]}
 
 LOW_PASS_SECONDS = 0.5  # s, time constant of the low-pass of both sides of a relation
 HUBER = 1.5  # robust standard deviations, beyond which a residual weighs less
@@ -150,14 +130,13 @@ def relations_among(channels: Sequence[str]) -> list[tuple[str, str, tuple[str, 
             declared.append((angle, "yaw_rate", ("r/u", "u r", "(u r)³/100", "1"), True))
         if angle in has and "ay" in has:
             declared.append((angle, "ay", ("ay/u²", "ay", "ay³/100", "1"), False))
+    turning = ("r²", "r") if "yaw_rate" in has else ()
     if "ax" in has:
         slide = (SIDESLIP_DRAG,) if {"ay", "yaw_rate"} <= has else ()
-        declared.append(
-            ("ax", speed, (RATE, *slide, *(("r²",) if "yaw_rate" in has else ()), "u²", "1"), False)
-        )
+        declared.append(("ax", speed, (RATE, *slide, *turning[:1], "u²", "1"), False))
     for wheel in channels:
         if wheel.startswith(("wheel_speed", "motor_speed")) and wheel != speed:
-            declared.append((wheel, speed, ("u", *(("r",) if "yaw_rate" in has else ())), True))
+            declared.append((wheel, speed, ("u", *turning[1:]), True))
     return declared
 
 
@@ -260,13 +239,8 @@ def least_speed_of(recordings: Sequence[Recording], channels: Sequence[str]) -> 
     speed = speed_channel(channels)
     if speed is None:
         return 1.0
-    return max(
-        MIN_SPEED_SHARE
-        * float(
-            np.nanmedian(np.abs(np.concatenate([recording[speed] for recording in recordings])))
-        ),
-        1e-6,
-    )
+    speeds = np.abs(np.concatenate([recording[speed] for recording in recordings]))
+    return max(MIN_SPEED_SHARE * float(np.nanmedian(speeds)), 1e-6)
 
 
 def residuals_of(
@@ -329,14 +303,11 @@ def learn_relations(
 
     def smoothed(name: str) -> FloatArray:
         """A column of all recordings, low-passed within each, at the usable samples, (N,)."""
-        pairs = [
-            (part[name], is_usable) for part, is_usable in zip(parts, usable_rows, strict=True)
-        ]
         low_pass = partial(scipy.signal.lfilter, [forget], [1.0, forget - 1.0])
         return np.concatenate(
             [
-                low_pass(values, zi=[(1.0 - forget) * values[0]])[0][is_usable]
-                for values, is_usable in pairs
+                low_pass(part[name], zi=[(1.0 - forget) * part[name][0]])[0][is_usable]
+                for part, is_usable in zip(parts, usable_rows, strict=True)
             ]
         )
 
@@ -354,23 +325,11 @@ def learn_relations(
             joined[SIDESLIP_DRAG] if SIDESLIP_DRAG in features else 0.0
         )
         if len(target_values) >= MIN_ROWS:
-            terms = dict(
-                zip(
-                    free,
-                    _robust(
-                        np.stack([joined[name] for name in free], axis=1), target_values
-                    ).tolist(),
-                    strict=True,
-                )
-            )
-            relations.append(
-                Relation(
-                    target,
-                    partner,
-                    terms | ({SIDESLIP_DRAG: -1.0} if SIDESLIP_DRAG in features else {}),
-                    instant,
-                )
-            )
+            design = np.stack([joined[name] for name in free], axis=1)
+            terms = dict(zip(free, _robust(design, target_values).tolist(), strict=True))
+            if SIDESLIP_DRAG in features:
+                terms[SIDESLIP_DRAG] = -1.0
+            relations.append(Relation(target, partner, terms, instant))
     return relations
 
 

@@ -14,6 +14,7 @@ The estimate stays as it is. Tyres that differ in stiffness alone are not detect
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -48,7 +49,7 @@ class TyreCheck:
         check_number("tyre_check.friction", self.friction, 1e-3, 1e2)
         check_numbers("tyre_check.weights", self.weights, 0.0, MAX_WEIGHT)
 
-    def scaled_by(self, factors: tuple[float, float]) -> TyreCheck:
+    def scaled_by(self, factors: Sequence[float]) -> TyreCheck:
         """The check with the weights for bands whose factors of the 90 % level, for v and β, are
         ``factors`` without it.
         """

@@ -184,23 +184,19 @@ def propose(
     is_car_measured = bool(in_world and find_turning(of_car))
     usable = of_car if is_car_measured else usable
     usable, turnings = (usable, []) if is_standing else _turnings_of_any_axes(usable)
-    if turnings and rate_hz is None:
-        rate_by_ax = _rate_by_ax(_search_around(turnings[0], usable, clock_hz))
-        if rate_by_ax is not None:
-            return replace(propose(columns, rate_by_ax, is_vbo=is_vbo), rate_hz=rate_by_ax)
-    if turnings and rate_hz is not None and not is_rate_sure:
-        decades = _wrong_decades(_search_around(turnings[0], usable, clock_hz))
-        if decades:
-            corrected_hz = rate_hz * 10.0**decades
-            return replace(propose(columns, corrected_hz, is_vbo=is_vbo), rate_hz=corrected_hz)
+    if turnings and (rate_hz is None or not is_rate_sure):
+        best = _search_around(turnings[0], usable, clock_hz)
+        true_hz = _rate_by_ax(best) if rate_hz is None else _rate_by_decades(best)
+        if true_hz is not None:
+            return replace(propose(columns, true_hz, is_vbo=is_vbo), rate_hz=true_hz)
     search = None if is_standing else _best_search(usable, turnings, clock_hz)
     motion = search.motion if search else None
     proposals = _assign(usable, search, wheels)
     proposals = _with_pose(proposals.with_notes(*wheel_notes), usable, motion)
     if is_standing:
-        standstill = f"speed below {MAX_STANDSTILL_SPEED:g} m/s"
         proposals = proposals.with_notes(
-            f"the car stands still throughout ({standstill}); channels are proposed by name only"
+            f"the car stands still throughout (speed below {MAX_STANDSTILL_SPEED:g} m/s); channels "
+            "are proposed by name only"
         )
     if is_car_measured:
         left_out = [f"'{name}'" for name, *_ in columns if name in in_world]
@@ -296,12 +292,12 @@ def _is_standing(columns: Sequence[Candidate]) -> bool:
     """Whether columns are named as speeds with units, and none of them ever exceeds
     MAX_STANDSTILL_SPEED.
     """
-    speeds = [column for column in columns if "vx" in column.hints and column.unit]
-    speeds = [column for column in speeds if column.measures("vx")]
-    limit = MAX_STANDSTILL_SPEED
-    return bool(speeds) and all(
-        column.size * si_factor(column.unit, "vx") < limit for column in speeds
-    )
+    speeds = [
+        column.size * si_factor(column.unit, "vx")
+        for column in columns
+        if "vx" in column.hints and column.unit and column.measures("vx")
+    ]
+    return bool(speeds) and max(speeds) < MAX_STANDSTILL_SPEED
 
 
 def _turnings_of_any_axes(
@@ -310,16 +306,12 @@ def _turnings_of_any_axes(
     """Columns that are used, and triples, best first, with x, y and z as named or, where it
     explains more, along any axes.
     """
-    as_named = list(columns)
+    choices = [list(columns)]
     any_axes = without_axes(columns)
-    turnings = find_turning(as_named)
-    if any_axes == as_named:
-        return as_named, turnings
-    alternative = find_turning(any_axes)
-    best_score = turnings[0].score if turnings else 0.0
-    if alternative and alternative[0].score > best_score:
-        return any_axes, alternative
-    return as_named, turnings
+    if any_axes != choices[0]:
+        choices.append(any_axes)
+    triples = [(choice, find_turning(choice)) for choice in choices]
+    return max(triples, key=lambda triple: triple[1][0].score if triple[1] else 0.0)
 
 
 def _search_around(turning: Turning, columns: Sequence[Candidate], rate_hz: float) -> Search:
@@ -345,22 +337,22 @@ def _best_search(
         strengths = [agreement.strength for agreement, _ in _agreements_with_ax(search)]
         return search.turning.score + AX_WEIGHT * max(strengths, default=0.0)
 
-    best_score = turnings[0].score
-    near = [turning for turning in turnings if turning.score > best_score - SCORE_MARGIN]
-    scores = [
-        (score(search), search)
-        for search in (_search_around(turning, columns, rate_hz) for turning in near)
+    searches = [
+        _search_around(turning, columns, rate_hz)
+        for turning in turnings
+        if turning.score > turnings[0].score - SCORE_MARGIN
     ]
-    _, best = max(scores, key=lambda entry: entry[0])
+    scores = {search: score(search) for search in searches}
+    best = max(searches, key=lambda search: scores[search]).turning.columns
     other_accelerations = [
-        (points + GRAVITY_WEIGHT * _gravity(search), search)
-        for points, search in scores
-        if all(
-            search.turning.columns[name] is best.turning.columns[name]
-            for name in ("vx", "yaw_rate")
-        )
+        search
+        for search in searches
+        if all(search.turning.columns[name] is best[name] for name in ("vx", "yaw_rate"))
     ]
-    return max(other_accelerations, key=lambda entry: entry[0])[1]
+    return max(
+        other_accelerations,
+        key=lambda search: scores[search] + GRAVITY_WEIGHT * _gravity(search),
+    )
 
 
 def _gravity(search: Search) -> float:
@@ -445,9 +437,9 @@ def _rate_by_ax(search: Search) -> float | None:
     return float(min(PLAIN_RATES_HZ, key=lambda plain: abs(math.log(plain / rate_hz))))
 
 
-def _wrong_decades(search: Search) -> int:
-    """Power of ten by which the rate is too low, where an acceleration is d(vx)/dt at another rate
-    only; else 0.
+def _rate_by_decades(search: Search) -> float | None:
+    """The rate times a power of ten, where an acceleration is d(vx)/dt at that rate only; else
+    None.
     """
     ay = search.turning.columns["ay"]
     motion = search.motion
@@ -458,8 +450,9 @@ def _wrong_decades(search: Search) -> int:
         if may_be_ax(column) and is_of_same_sensor and abs(agreement) >= CLEAR_CORRELATION:
             size = si_factor(column.unit or search.turning.units["ay"], "ax")
             decades = math.log10(size * float(np.std(column.slow) / np.std(change)))
-            return round(decades) if abs(decades - round(decades)) < MAX_DECADE_ERROR else 0
-    return 0
+            is_whole = abs(decades - round(decades)) < MAX_DECADE_ERROR
+            return motion.rate_hz * 10.0 ** round(decades) if is_whole and round(decades) else None
+    return None
 
 
 # --- channels --------------------------------------------------------------------------------

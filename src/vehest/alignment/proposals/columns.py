@@ -219,14 +219,10 @@ def candidates(
         ):
             continue
         is_measured[is_measured] = ~_stray(values[is_measured])
-        bridged = (
-            values
-            if is_measured.all()
-            else np.interp(np.arange(len(values)), np.flatnonzero(is_measured), values[is_measured])
-        )
-        usable.append(
-            Candidate(name, unit, bridged, slow_of(bridged, rate_hz), roles, device=device)
-        )
+        if not is_measured.all():
+            rows = np.flatnonzero(is_measured)
+            values = np.interp(np.arange(len(values)), rows, values[rows])
+        usable.append(Candidate(name, unit, values, slow_of(values, rate_hz), roles, device=device))
     return usable
 
 

@@ -147,13 +147,16 @@ def fitting_channels(search: Search) -> tuple[dict[str, Proposal], tuple[str, ..
     proposals = {
         offer.proposal.channel: _with_rivals(offer, rivals[row]) for row, offer in chosen.items()
     }
-    references = set(REFERENCES) & set(proposals)
     second_offers = [
-        offer for offer in rivals[2] if references and offer.proposal.channel not in references
+        offer
+        for offer in rivals[2]
+        if 2 in chosen
+        and offer.proposal.channel not in proposals
+        and offer.score >= MIN_SECOND_SCORE
     ]
-    second = max(second_offers, key=lambda offer: offer.score, default=None)
-    if second is None or second.score < MIN_SECOND_SCORE:
+    if not second_offers:
         return proposals, ()
+    second = max(second_offers, key=lambda offer: offer.score)
     search.free.remove(second.column)
     columns_of = {offer.proposal.channel: offer.column for offer in (chosen[2], second)}
     velocity, angle = (columns_of[channel] for channel in REFERENCES)
@@ -180,7 +183,7 @@ def _with_rivals(chosen: Offer, rivals: Sequence[Offer]) -> Proposal:
     """
 
     def is_named(offer: Offer) -> bool:
-        return any(role in offer.column.hints for role in NAMED_LIKE[offer.proposal.channel])
+        return not offer.column.hints.keys().isdisjoint(NAMED_LIKE[offer.proposal.channel])
 
     near = tuple(
         rival.column.name
@@ -192,13 +195,10 @@ def _with_rivals(chosen: Offer, rivals: Sequence[Offer]) -> Proposal:
         )
     )
     proposal = chosen.proposal
-    return (
-        replace(
-            proposal, question=f"{' and '.join(near)} would fit equally well", alternatives=near
-        )
-        if near and not proposal.question
-        else proposal
-    )
+    if proposal.question or not near:
+        return proposal
+    question = f"{' and '.join(near)} would fit equally well"
+    return replace(proposal, question=question, alternatives=near)
 
 
 def may_be_ax(column: Candidate) -> bool:
@@ -282,20 +282,11 @@ def _as_steering(search: Search, column: Candidate) -> Offer | None:
             "its range and the slow corners match neither a road-wheel nor a steering-wheel angle: "
             "if it is a command, state its scale"
         )
-        return Offer(
-            score,
-            column,
-            Proposal(
-                column.name,
-                "steer",
-                unit,
-                sign,
-                evidence,
-                question,
-                offset=offset,
-                is_weak=not hint or "handwheel" in column.hints,
-            ),
+        is_weak = not hint or "handwheel" in column.hints
+        proposal = Proposal(
+            column.name, "steer", unit, sign, evidence, question, offset=offset, is_weak=is_weak
         )
+        return Offer(score, column, proposal)
     _, channel, unit, length, largest_angle, is_repeatable = min(possible)
     rival_angles = sorted({(angle.channel, angle.unit) for angle in possible} - {(channel, unit)})
     alternatives = tuple(" ".join(pair) for pair in rival_angles)
@@ -312,7 +303,7 @@ def _as_steering(search: Search, column: Candidate) -> Offer | None:
             f", {'wheelbase' if channel == 'steer' else 'wheelbase × steering ratio'} {length:.3g} "
             "m from slow corners"
         )
-    ay = search.motion.channels.get("ay", search.motion.turning)
+    ay = _lateral_acceleration(search.motion)
     ay_correlation = abs(correlation(column.slow, slow_of(ay, search.motion.rate_hz)))
     is_weak = not (hint or column.unit) and ay_correlation >= best.strength
     if is_weak:
@@ -323,13 +314,12 @@ def _as_steering(search: Search, column: Candidate) -> Offer | None:
     if channel == "steer" and column.hints.get("handwheel") == STRONG:
         question = "its name suggests a steering wheel, its range and slow corners a road wheel"
         is_weak = True
-    evidence = (*evidence, text)
     proposal = Proposal(
         column.name,
         channel,
         unit,
         sign,
-        evidence,
+        (*evidence, text),
         question,
         alternatives=alternatives,
         is_weak=is_weak,
@@ -431,10 +421,8 @@ def _is_plausible(motion: Motion, column: Candidate, fit: Agreement) -> bool:
 
 def _name_evidence(column: Candidate, *roles: str) -> Sequence[str]:
     """``name``, ``unit`` or both as evidence, in a list; empty where neither speaks for a role."""
-    parts = [
-        *(["name"] if any(role in column.hints for role in roles) else []),
-        *(["unit"] if column.unit else []),
-    ]
+    parts = ["name"] if set(roles) & set(column.hints) else []
+    parts += ["unit"] if column.unit else []
     return [" and ".join(parts)] if parts else []
 
 
@@ -528,7 +516,7 @@ def angles(motion: Motion, column: Candidate) -> list[Angle]:
     list of Angle
         Empty where no unit gives a possible length and range.
     """
-    ay = motion.channels.get("ay", motion.turning)
+    ay = _lateral_acceleration(motion)
     rows = _calm(motion)
     slope, offset = _regressed(motion, column, rows, ay)
     of_halves = [_regressed(motion, column, half, ay)[0] for half in np.array_split(rows, 2)]
@@ -540,35 +528,32 @@ def angles(motion: Motion, column: Candidate) -> list[Angle]:
         for unit in column.units("steer"):
             factor = si_factor(unit, channel)
             length = abs(slope) * factor
+            largest_si = largest_angle * factor
             shortest = MIN_MODEL_WHEELBASE if is_model and channel == "steer" else low
-            straight = channel == "handwheel" or abs(offset) * factor < MAX_STRAIGHT_ANGLE
             if (
                 shortest <= length <= high
-                and largest_angle * factor <= MAX_ANGLES[channel]
-                and straight
+                and largest_si <= MAX_ANGLES[channel]
+                and (channel == "handwheel" or abs(offset) * factor < MAX_STRAIGHT_ANGLE)
             ):
-                possible.append(
-                    Angle(
-                        abs(math.log(length / TYPICAL_LENGTHS[channel])),
-                        channel,
-                        unit,
-                        length,
-                        largest_angle * factor,
-                        is_repeatable,
-                    )
-                )
+                oddness = abs(math.log(length / TYPICAL_LENGTHS[channel]))
+                possible.append(Angle(oddness, channel, unit, length, largest_si, is_repeatable))
     return possible
 
 
 def cornering_length(motion: Motion, column: Candidate) -> float:
     """Change of an angle of steering by yaw_rate/vx in slow corners [its unit · m]."""
-    ay = motion.channels.get("ay", motion.turning)
+    ay = _lateral_acceleration(motion)
     return abs(_regressed(motion, column, _calm(motion), ay)[0])
+
+
+def _lateral_acceleration(motion: Motion) -> FloatArray:
+    """ay where it is known, else vx·yaw_rate [m/s²], (T,)."""
+    return motion.channels.get("ay", motion.turning)
 
 
 def _calm(motion: Motion) -> NDArray[np.int64]:
     """Samples of slow corners, if there are enough, else of the drive."""
-    ay = motion.channels.get("ay", motion.turning)
+    ay = _lateral_acceleration(motion)
     driven = _driven(motion)
     calm = driven & (np.abs(ay) <= 0.5 * float(np.quantile(np.abs(ay), 0.95)) + 1e-9)
     return np.flatnonzero(calm if calm.sum() >= MIN_CALM_SAMPLES else driven)

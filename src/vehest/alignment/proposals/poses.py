@@ -59,12 +59,8 @@ def find_pose(
     driven = np.abs(slow_of(motion.vx, motion.rate_hz))
     for unit in [x.unit] if x.unit else LENGTH_UNITS:
         scale = factor_to_si(unit, "m") * motion.rate_hz
-        speed = np.hypot(
-            *(
-                slow_of(np.gradient(coordinate.values) * scale, motion.rate_hz)
-                for coordinate in (x, y)
-            )
-        )
+        velocities = (np.gradient(coordinate.values) * scale for coordinate in (x, y))
+        speed = np.hypot(*(slow_of(samples, motion.rate_hz) for samples in velocities))
         if (
             1.0 / MAX_SPEED_GAIN < rms(speed) / rms(driven) < MAX_SPEED_GAIN
             and correlation(speed, driven) > MIN_CORRELATION

@@ -168,17 +168,16 @@ class Proposals:
         accelerations alone are reversed, as those of telephones are.
         """
         signs = {name: proposal.sign for name, proposal in self.by_channel.items()}
-        axes = [signs.get("ax", signs.get("vx")), signs.get("ay"), signs.get("yaw_rate")]
-        axis_signs = [sign for sign in axes if sign is not None]
-        is_right_handed = len(axis_signs) == len(axes) and math.prod(axis_signs) == 1
+        axes = [signs.get("ax", signs.get("vx", 0)), signs.get("ay", 0), signs.get("yaw_rate", 0)]
+        is_right_handed = math.prod(axes) == 1
         doubt = "sign: ax, ay and yaw_rate do not form a right-handed set of axes"
         if is_right_handed and axes[0] == -1:
             is_right_handed = False
             doubt = "sign: the unit is mounted backwards, or only its accelerations are reversed"
         changes = {}
-        for proposal in self.channels:
-            if proposal.channel in TILT:
-                signed = replace(proposal, sign=signs.get(TILT[proposal.channel], 1))
+        for name, acceleration in TILT.items():
+            if name in signs:
+                signed = replace(self.by_channel[name], sign=signs.get(acceleration, 1))
                 signed = signed.with_evidence("sign from the axes of ax, ay and yaw_rate")
-                changes[proposal.channel] = signed.questioned("" if is_right_handed else doubt)
+                changes[name] = signed.questioned("" if is_right_handed else doubt)
         return self.changed(changes)

@@ -226,19 +226,13 @@ def turning_by_names(columns: Sequence[Candidate]) -> Turning | None:
     columns_by_channel = {}
     units = {}
     for channel in ("vx", "yaw_rate"):
-        candidates_for = [
-            candidate for candidate in _pool(columns, channel) if channel in candidate.hints
-        ]
-        if not candidates_for:
+        named = [candidate for candidate in _pool(columns, channel) if channel in candidate.hints]
+        if not named:
             return None
-        forward = [
-            candidate
-            for candidate in candidates_for
-            if channel == "vx" and _is_forward(candidate.slow)
-        ]
         columns_by_channel[channel] = column = max(
-            forward or candidates_for,
+            named,
             key=lambda candidate: (
+                channel == "vx" and _is_forward(candidate.slow),
                 candidate.hints[channel],
                 not is_filtered(candidate.name),
                 bool(candidate.unit),
@@ -248,16 +242,10 @@ def turning_by_names(columns: Sequence[Candidate]) -> Turning | None:
         units[channel] = next(
             (unit for unit in offered if is_plausible(column.size, channel, unit)), offered[0]
         )
-    is_same_column = columns_by_channel["vx"] is columns_by_channel["yaw_rate"]
-    return (
-        None
-        if is_same_column
-        else Turning(
-            columns_by_channel,
-            units,
-            all(candidate.unit for candidate in columns_by_channel.values()),
-        )
-    )
+    if columns_by_channel["vx"] is columns_by_channel["yaw_rate"]:
+        return None
+    has_units = all(candidate.unit for candidate in columns_by_channel.values())
+    return Turning(columns_by_channel, units, has_units)
 
 
 def _centred(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -271,13 +259,11 @@ def _pool(columns: Sequence[Candidate], channel: str) -> list[Candidate]:
     pool = [
         column
         for column in columns
-        if channel in column.hints
-        or STRONG not in {column.hints.get(role) for role in (*FOLLOWING, *NO_MOTION)}
-    ]
-    pool = [
-        column
-        for column in pool
-        if column.measures(channel)
+        if (
+            channel in column.hints
+            or STRONG not in {column.hints.get(role) for role in (*FOLLOWING, *NO_MOTION)}
+        )
+        and column.measures(channel)
         and (channel != "vx" or "vx" in column.hints or _is_forward(column.slow))
         and (channel in ("ay", *column.hints) or not ACCELERATIONS & set(column.hints))
     ]
@@ -480,8 +466,7 @@ def repeated(search: Search) -> Iterator[Proposal]:
             search.free.remove(component)
         for column in search.free:
             agreement = correlation(column.slow, first.column.slow)
-            unit = _unit(column, first, channel, agreement)
-            if unit:
+            if unit := _unit(column, first, channel, agreement):
                 repeats.append(Repeat(column, unit, -first.sign if agreement < 0.0 else first.sign))
             elif (
                 channel == "vx"
@@ -662,15 +647,13 @@ def _separated(family: Sequence[Repeat], channel: str) -> list[Proposal]:
             alternatives=tuple(repeat.column.name for repeat in of_car[1:]),
             is_repeated=True,
         )
-        reference_column = references[0].column
+        column = references[0].column
         reason = (
-            "named as a reference"
-            if reference_column.is_reference
-            else "the other one is from the car's bus"
+            "named as a reference" if column.is_reference else "the other one is from the car's bus"
         )
         question = (
             ""
-            if reference_column.is_reference or channel in reference_column.hints
+            if column.is_reference or channel in column.hints
             else f"is it the reference's {channel}? Its name does not say so"
         )
         second = references[0].proposal(
@@ -682,27 +665,18 @@ def _separated(family: Sequence[Repeat], channel: str) -> list[Proposal]:
     question = (
         f"which column is the car's own {channel}, and which the reference's? No name decides"
     )
-    roughness = {
-        id(repeat): float(np.std(np.diff(repeat.column.values, 2)))
-        / max(float(np.std(repeat.column.values)), 1e-12)
-        for repeat in plain
-    }
-    rough, smooth = sorted(plain, key=lambda repeat: roughness[id(repeat)], reverse=True)[:2]
+
+    def roughness(repeat: Repeat) -> float:
+        values = repeat.column.values
+        return float(np.std(np.diff(values, 2))) / max(float(np.std(values)), 1e-12)
+
+    rough, smooth = sorted(plain, key=roughness, reverse=True)[:2]
     return [
-        rough.proposal(
-            channel,
-            text,
-            "the noisier of the two",
-            question=question,
-            alternatives=(reference,),
-            is_repeated=True,
-        ),
-        smooth.proposal(
-            reference,
-            text,
-            "the smoother of the two",
-            question=question,
-            alternatives=(channel,),
-            is_repeated=True,
-        ),
+        repeat.proposal(
+            proposed, text, reason, question=question, alternatives=(other,), is_repeated=True
+        )
+        for repeat, proposed, other, reason in (
+            (rough, channel, reference, "the noisier of the two"),
+            (smooth, reference, channel, "the smoother of the two"),
+        )
     ]

@@ -140,21 +140,14 @@ def speed_of_wheels(
         cost, radius = _cost(unit, scale, mean)
         ranked.append((cost + _penalty(wheels, unit) + IMPLAUSIBLE * implausible, unit, radius))
     _, unit, radius = min(ranked)
-    speed = mean * (
+    factor = (
         si_factor(unit, "vx")
         if is_unit_of(unit, "vx")
         else radius * si_factor(unit, "wheel_speed_fl")
     )
-    return [
-        Candidate(
-            "mean of the wheels",
-            "m/s",
-            speed,
-            slow_of(speed, rate_hz),
-            {"vx": WEAK},
-            is_wheel_mean=True,
-        )
-    ]
+    speed = mean * factor
+    slow = slow_of(speed, rate_hz)
+    return [Candidate("mean of the wheels", "m/s", speed, slow, {"vx": WEAK}, is_wheel_mean=True)]
 
 
 def wheel_proposals(
@@ -186,16 +179,16 @@ def wheel_proposals(
     radius = NOMINAL_RADIUS
     is_weak = False
     if motion is None:
-        unit, question = (
-            ("rad/s", "unit: there is no speed to compare it with")
-            if len(units) > 1
-            else (units[0], "")
-        )
+        unit = units[0]
+        question = ""
+        if len(units) > 1:
+            unit = "rad/s"
+            question = "unit: there is no speed to compare it with"
     else:
         scale = rms(motion.vx) / (rms(mean) or 1.0)
-        costs = [(unit, *_cost(unit, scale, mean)) for unit in units]
+        costs = [(*_cost(unit, scale, mean), unit) for unit in units]
         ranked = sorted(
-            (cost + _penalty(wheels, unit), radius, unit) for unit, cost, radius in costs
+            (cost + _penalty(wheels, unit), radius, unit) for cost, radius, unit in costs
         )
         cost, radius, unit = ranked[0]
         question = ""

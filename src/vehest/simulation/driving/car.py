@@ -164,16 +164,9 @@ def car_of(plant: MultiBodyPlant) -> Car:
         lateral acceleration is below 1 m/s².
     """
     driver_values = dict(plant.vehicle.driver)
-    key = json.dumps(
-        [
-            plant.vehicle.name,
-            plant.vehicle.parameter_set,
-            plant.vehicle.overrides,
-            driver_values,
-            plant.step,
-        ],
-        sort_keys=True,
-    )
+    vehicle = plant.vehicle
+    values = [vehicle.name, vehicle.parameter_set, vehicle.overrides, driver_values, plant.step]
+    key = json.dumps(values, sort_keys=True)
     if key not in _CARS:
         _CARS[key] = _driver_view(plant, driver_values)
     return _CARS[key]
@@ -196,33 +189,37 @@ def _driver_view(plant: MultiBodyPlant, driver_values: Mapping[str, Any]) -> Car
             f"vehicle '{vehicle.name}': unknown values {unknown} of its driver; known ones: "
             f"{', '.join(_DRIVER_VALUES)}"
         )
+
+    def driver_value(name: str, default: float) -> float:
+        value = float(driver_values.get(name, default))
+        if not (math.isfinite(value) and value > 0.0):
+            raise ConfigurationError(
+                f"vehicle '{vehicle.name}': the driver's {name} must be positive, not {value}"
+            )
+        return value
+
     front_share = parameters.b / (parameters.a + parameters.b)
     driven_axle = min(
         _ratio(front_share, parameters.T_se), _ratio(1.0 - front_share, 1.0 - parameters.T_se)
     )
-    top_speed = _driver_value(
-        driver_values, "top_speed", parameters.longitudinal.v_max, vehicle.name
-    )
+    longitudinal = parameters.longitudinal
+    top_speed = driver_value("top_speed", longitudinal.v_max)
     accelerations, steers, slips = _measure(plant, min(TEST_SPEED, 0.5 * top_speed))
-    grip = _driver_value(driver_values, "grip", accelerations[-1], vehicle.name)
     return Car(
         name=vehicle.name,
         wheelbase=plant.wheelbase,
         width=parameters.w,
         front_share=front_share,
-        grip=grip,
+        grip=driver_value("grip", accelerations[-1]),
         driving_share=min(TRACTION_SHARE * driven_axle, TRACTION_SHARE),
-        power_per_mass=_driver_value(
-            driver_values,
-            "power_per_mass",
-            POWER_SHARE * parameters.longitudinal.a_max * parameters.longitudinal.v_switch,
-            vehicle.name,
+        power_per_mass=driver_value(
+            "power_per_mass", POWER_SHARE * longitudinal.a_max * longitudinal.v_switch
         ),
         top_speed=top_speed,
         drag=0.5
         * AIR_DENSITY
         / parameters.m
-        * _driver_value(driver_values, "drag_area", DRAG_AREA * parameters.w**2, vehicle.name),
+        * driver_value("drag_area", DRAG_AREA * parameters.w**2),
         steering_rate=parameters.steering.v_max,
         largest_steer=parameters.steering.max,
         lateral_acceleration=accelerations,
@@ -236,20 +233,6 @@ def _ratio(load: float, torque: float) -> float:
     would slip; infinite for an axle that is not driven.
     """
     return load / torque if torque > 0.0 else math.inf
-
-
-def _driver_value(
-    driver_values: Mapping[str, Any], name: str, default: float, vehicle_name: str
-) -> float:
-    """One of the driver's values, or its default; raises an error where it is not finite and
-    positive.
-    """
-    value = float(driver_values.get(name, default))
-    if not (math.isfinite(value) and value > 0.0):
-        raise ConfigurationError(
-            f"vehicle '{vehicle_name}': the driver's {name} must be positive, not {value}"
-        )
-    return value
 
 
 def _measure(

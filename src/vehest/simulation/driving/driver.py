@@ -20,6 +20,7 @@ import numpy as np
 from vehest.constants import GRAVITY, FloatArray
 from vehest.data.errors import ConfigurationError
 from vehest.simulation.driving.car import Car
+from vehest.simulation.random_streams import STYLE, random_stream
 from vehest.simulation.road.course import Course
 from vehest.simulation.road.lines import Line
 
@@ -174,7 +175,7 @@ def draw_style(
     ConfigurationError
         Share and ripple together leave the range from 0 to 1, as `DrivingStyle` checks.
     """
-    generator = np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=(0,)))
+    generator = random_stream(seed, STYLE)
     grip_fraction = float(generator.uniform(*grip_range))
     phases = generator.uniform(0.0, 2.0 * math.pi, (2, len(WAVELENGTHS))).tolist()
     return DrivingStyle(
@@ -332,14 +333,9 @@ class Hands:
         frequencies = LOWEST_CORRECTION * (
             HIGHEST_CORRECTION / LOWEST_CORRECTION
         ) ** generator.uniform(size=24)
+        phases = generator.uniform(0.0, 2.0 * math.pi, 24)
         self.size = size
-        self._waves = list(
-            zip(
-                (2.0 * math.pi * frequencies).tolist(),
-                generator.uniform(0.0, 2.0 * math.pi, 24).tolist(),
-                strict=True,
-            )
-        )
+        self._waves = np.stack([2.0 * math.pi * frequencies, phases], axis=1).tolist()
 
     def at(self, time: float, load: float) -> float:
         """Lateral acceleration that the corrections ask for at a time [m/s²].
@@ -398,15 +394,10 @@ class Follower:
         self._speed_at = speed_at
         self._per_metre = 1.0 / float(plan.distance[1])
         self._last_cell = len(plan.distance) - 2
-        self._x = plan.x.tolist()
-        self._y = plan.y.tolist()
-        self._heading = plan.heading.tolist()
-        self._curvature = plan.curvature.tolist()
-        self._speed = plan.speed.tolist()
-        self._acceleration = plan.acceleration.tolist()
-        self._friction = plan.friction.tolist()
-        self._bank = plan.bank.tolist()
-        self._grade = plan.grade.tolist()
+        along_plan = {**vars(plan), "acceleration": plan.acceleration}
+        self._values: dict[str, list[float]] = {
+            name: values.tolist() for name, values in along_plan.items()
+        }
 
     @property
     def start(self) -> tuple[float, float, float, float]:
@@ -418,11 +409,8 @@ class Follower:
             x, y, heading and speed on the plan at ``progress``; with ``speed_at`` the speed of long
             before the first sample.
         """
-        cell, share = self._cell(self.progress)
-        x, y, heading, speed = (
-            _between(values, cell, share)
-            for values in (self._x, self._y, self._heading, self._speed)
-        )
+        cell = self._cell(self.progress)
+        x, y, heading, speed = (self._at(name, cell) for name in ("x", "y", "heading", "speed"))
         return x, y, heading, self._speed_at(-math.inf)[0] if self._speed_at else speed
 
     def command(self, time: float, observation: Observation) -> Command:
@@ -449,18 +437,16 @@ class Follower:
         driver = self.driver
         speed = observation.speed
         sideslip = observation.sideslip
-        lateral_error, heading_error, cell, share = self._locate(observation, sideslip)
-        ahead, share_ahead = self._cell(
-            self.progress + speed * (driver.steering_lag + driver.response * speed)
-        )
-        friction = max(_between(self._friction, ahead, share_ahead), 0.05)
-        bank = _between(self._bank, cell, share)
-        grade = _between(self._grade, cell, share)
+        lateral_error, heading_error, cell = self._locate(observation, sideslip)
+        ahead = self._cell(self.progress + speed * (driver.steering_lag + driver.response * speed))
+        friction = max(self._at("friction", ahead), 0.05)
+        bank = self._at("bank", cell)
+        grade = self._at("grade", cell)
         grip = car.grip * friction
 
         preview = max(speed * driver.preview_time, 3.0)
         error_ahead = lateral_error + preview * math.sin(heading_error)
-        planned_curvature = _between(self._curvature, ahead, share_ahead)
+        planned_curvature = self._at("curvature", ahead)
         max_curvature = driver.saturation * grip / max(speed, 1.0) ** 2
         curvature = max(
             -max_curvature, min(max_curvature, planned_curvature - 2.0 * error_ahead / preview**2)
@@ -485,10 +471,7 @@ class Follower:
         target, feedforward = (
             self._speed_at(time)
             if self._speed_at
-            else (
-                _between(self._speed, cell, share),
-                _between(self._acceleration, ahead, share_ahead),
-            )
+            else (self._at("speed", cell), self._at("acceleration", ahead))
         )
         resistance = car.resistance(
             speed, observation.yaw_rate, observation.steer, sideslip
@@ -504,10 +487,10 @@ class Follower:
             acceleration=max(lowest, min(highest, acceleration)),
             progress=self.progress,
             lateral_error=lateral_error,
-            friction=_between(self._friction, cell, share),
+            friction=self._at("friction", cell),
             bank=bank,
             grade=grade,
-            heading=_between(self._heading, cell, share),
+            heading=self._at("heading", cell),
         )
 
     def _per_curvature(self, speed: float, friction: float) -> float:
@@ -518,26 +501,22 @@ class Follower:
         moderate = 0.5 * self.car.grip * friction
         return car.wheelbase + abs(car.steer_for(0.0, moderate, friction)) / moderate * speed**2
 
-    def _locate(self, observation: Observation, sideslip: float) -> tuple[float, float, int, float]:
+    def _locate(
+        self, observation: Observation, sideslip: float
+    ) -> tuple[float, float, tuple[int, float]]:
         """Lateral error [m], heading error [rad] and cell of the plan, by two Newton steps from the
         last progress.
         """
         for _ in range(2):
-            cell, share = self._cell(self.progress)
-            heading = _between(self._heading, cell, share)
-            dx = observation.x - _between(self._x, cell, share)
-            dy = observation.y - _between(self._y, cell, share)
+            cell = self._cell(self.progress)
+            heading = self._at("heading", cell)
+            dx = observation.x - self._at("x", cell)
+            dy = observation.y - self._at("y", cell)
             along = math.cos(heading)
             across = math.sin(heading)
             self.progress = max(self.progress + dx * along + dy * across, 0.0)
-        error = dy * along - dx * across
-        cell, share = self._cell(self.progress)
-        return (
-            error,
-            math.remainder(observation.yaw + sideslip - heading, 2.0 * math.pi),
-            cell,
-            share,
-        )
+        heading_error = math.remainder(observation.yaw + sideslip - heading, 2.0 * math.pi)
+        return dy * along - dx * across, heading_error, self._cell(self.progress)
 
     def _cell(self, distance: float) -> tuple[int, float]:
         """Index of the sample before a distance [m], and the share of the way to the next one, held
@@ -546,6 +525,12 @@ class Follower:
         position = distance * self._per_metre
         before = min(max(int(position), 0), self._last_cell)
         return before, min(max(position - before, 0.0), 1.0)
+
+    def _at(self, name: str, cell: tuple[int, float]) -> float:
+        """A quantity of the plan, interpolated between two samples at a share of the way."""
+        before, share = cell
+        low, high = self._values[name][before : before + 2]
+        return low + share * (high - low)
 
 
 def steering_velocity(car: Car, driver: Driver, target_steer: float, steer: float) -> float:
@@ -569,12 +554,6 @@ def steering_velocity(car: Car, driver: Driver, target_steer: float, steer: floa
     return max(
         -car.steering_rate, min(car.steering_rate, (target_steer - steer) / driver.steering_lag)
     )
-
-
-def _between(values: list[float], before: int, share: float) -> float:
-    """Linear interpolation between a sample and the next one, at a share of the way."""
-    low = values[before]
-    return low + share * (values[before + 1] - low)
 
 
 def _repeat(values: FloatArray, n_laps: int, per_lap: float = 0.0) -> FloatArray:

@@ -18,9 +18,8 @@ from vehest.simulation.road.surface import Surface
 COMMAND_RATE_HZ = 100.0  # rate at which the driver's hands reach the car
 MIN_SPEED = 0.9  # speed below which the driver always gives gas [m/s]
 SPEED_MARGIN = 1.0  # speed over the wanted one at which the driver brakes [m/s]
-MAX_CALM_SIDESLIP = (
-    0.12  # sideslip angle below which the driver brakes, and has caught a slide [rad]
-)
+# sideslip angle below which the driver brakes, and has caught a slide [rad]
+MAX_CALM_SIDESLIP = 0.12
 COUNTERSTEER = 1.5  # road-wheel angle over sideslip angle while a slide is caught
 
 

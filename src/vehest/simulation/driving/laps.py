@@ -31,12 +31,10 @@ from vehest.simulation.driving.manoeuvre import (
     draw_driver,
     require,
 )
+from vehest.simulation.random_streams import TRAFFIC, random_stream
 from vehest.simulation.road.course import Course, course_by_name
 from vehest.simulation.road.surface import Surface
 
-# random stream of the traffic in a drive's seed; 0 to 4 are the style's, the sensors', the
-# surface's, the manoeuvre's and the fleet's
-_TRAFFIC_STREAM = 5
 TRAFFIC_LENGTH = (50.0, 400.0)  # shortest and longest segment behind a slower car [m]; assumed
 
 
@@ -146,9 +144,7 @@ class Laps(Manoeuvre):
         spacing = float(course.arc_length[1])
         speeds = np.full(n_laps * cells + 1, highest)
         for lap in range(n_laps):
-            generator = np.random.default_rng(
-                np.random.SeedSequence(entropy=seed, spawn_key=(_TRAFFIC_STREAM, lap))
-            )
+            generator = random_stream(seed, TRAFFIC, lap)
             for _ in range(int(generator.poisson(self.traffic))):
                 begin = lap * cells + int(generator.uniform(0.0, cells))
                 length = int(generator.uniform(*TRAFFIC_LENGTH) / spacing)

@@ -13,6 +13,7 @@ import numpy as np
 from vehest.data.errors import ConfigurationError
 from vehest.simulation.driving.car import Car
 from vehest.simulation.driving.driver import Command, Driver, Follower, Observation, Plan
+from vehest.simulation.random_streams import MANOEUVRE, random_stream
 from vehest.simulation.road.lines import Line
 from vehest.simulation.road.surface import Surface
 
@@ -24,10 +25,6 @@ Side = Literal["left", "right", "either"]  # side to which a manoeuvre goes firs
 COMMON_LIMITS = {"half_width": (0.5, 50.0), "line_offset": (0.0, 3.0)}
 SETTLING_TIME = 2.0  # time that is driven before the first sample [s]
 OPEN_AREA_LAP = 2000.0  # distance after which an open area's patches of friction repeat [m]
-
-# random stream of the manoeuvre in a drive's seed; 0 is the style's, 1 the sensors', 2 the
-# surface's
-_STREAM = 3
 
 
 class Controller(Protocol):
@@ -185,9 +182,7 @@ class Draws:
     """Values that the seed of a drive draws for its manoeuvre, in a fixed order."""
 
     def __init__(self, seed: int) -> None:
-        self.generator = np.random.default_rng(
-            np.random.SeedSequence(entropy=seed, spawn_key=(_STREAM, 0))
-        )
+        self.generator = random_stream(seed, MANOEUVRE, 0)
 
     def __call__(self, value: Range) -> float:
         """A value of the range, uniformly; also a plain number takes one draw, so that later ones
@@ -218,7 +213,7 @@ def draw_driver(seed: int) -> Driver:
         Preview, response, lag, damping and countersteer within 10 to 20 % of the defaults,
         uniformly.
     """
-    generator = np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=(_STREAM, 1)))
+    generator = random_stream(seed, MANOEUVRE, 1)
     usual = Driver()
     spread = {
         "preview_time": 0.1,

@@ -70,28 +70,14 @@ class StepSteer(Manoeuvre):
             The step begins between 1 and 2 s after the first sample; its angle is that of a steady
             turn with ``severity`` of the grip, on mean friction.
         """
-        draw = Draws(seed)
-        speed = min(draw(self.speed), FASTEST_SHARE * car.top_speed)
-        severity, steer_time, turn_time = (
-            draw(values) for values in (self.severity, self.steer_time, self.turn_time)
-        )
-        side = draw.side(self.side)
-        begin = draw((1.0, 2.0))
-        area = OpenArea(surface, seed)
-        angle = side * _steer_at(car, severity, speed, area.mean)
+        area, drawn, turn_time = _drawn_turn(self, "steer_time", self.turn_time, car, surface, seed)
+        begin = drawn["begin"]
+        steer_time = drawn["steer_time"]
 
         def steer_at(time: float) -> float:
-            return angle * min(max((time - begin) / steer_time, 0.0), 1.0)
+            return float(drawn["steer"] * min(max((time - begin) / steer_time, 0.0), 1.0))
 
-        drawn = {
-            "speed": speed,
-            "severity": severity,
-            "steer": angle,
-            "begin": begin,
-            "steer_time": steer_time,
-            "side": SIDES[side],
-        }
-        return OpenLoop(car, area, speed, steer_at, begin + steer_time + turn_time, drawn)
+        return OpenLoop(car, area, drawn["speed"], steer_at, begin + steer_time + turn_time, drawn)
 
 
 @dataclass(frozen=True)
@@ -134,15 +120,10 @@ class Spiral(Manoeuvre):
             The angle is piecewise linear in time: up within ``ramp_time``, held, and back to zero;
             then, for two turns, the same to the other side.
         """
-        draw = Draws(seed)
-        speed = min(draw(self.speed), FASTEST_SHARE * car.top_speed)
-        severity, ramp, hold = (
-            draw(values) for values in (self.severity, self.ramp_time, self.hold_time)
-        )
-        side = draw.side(self.side)
-        begin = draw((1.0, 2.0))
-        area = OpenArea(surface, seed)
-        angle = side * _steer_at(car, severity, speed, area.mean)
+        area, drawn, hold = _drawn_turn(self, "ramp_time", self.hold_time, car, surface, seed)
+        begin = drawn["begin"]
+        ramp = drawn["ramp_time"]
+        angle = drawn["steer"]
         back = min(0.4 * ramp, 3.0)
         times = [begin, begin + ramp, begin + ramp + hold, begin + ramp + hold + back]
         angles = [0.0, angle, angle, 0.0]
@@ -154,15 +135,7 @@ class Spiral(Manoeuvre):
         def steer_at(time: float) -> float:
             return float(np.interp(time, times, angles))
 
-        drawn = {
-            "speed": speed,
-            "severity": severity,
-            "steer": angle,
-            "begin": begin,
-            "ramp_time": ramp,
-            "side": SIDES[side],
-        }
-        return OpenLoop(car, area, speed, steer_at, times[-1] + 1.0, drawn)
+        return OpenLoop(car, area, drawn["speed"], steer_at, times[-1] + 1.0, drawn)
 
 
 @dataclass(frozen=True)
@@ -218,13 +191,10 @@ class RandomSteer(Manoeuvre):
 
         def steer_at(time: float) -> float:
             fade = min(max((time + 0.5) / 1.0, 0.0), 1.0)
-            return (
-                fade
-                * amplitude
-                * sum(
-                    math.sin(rate * time + phase) for rate, phase in zip(rates, phases, strict=True)
-                )
+            waves = (
+                math.sin(rate * time + phase) for rate, phase in zip(rates, phases, strict=True)
             )
+            return fade * amplitude * sum(waves)
 
         drawn = {"speed": speed, "severity": severity, "steer_deviation": deviation}
         return OpenLoop(car, area, speed, steer_at, self.duration, drawn)
@@ -294,6 +264,37 @@ class OpenLoop:
             friction=friction,
             finished=time >= self._end_time,
         )
+
+
+def _drawn_turn(
+    manoeuvre: StepSteer | Spiral,
+    steering_time: str,
+    time_after: Range,
+    car: Car,
+    surface: Surface,
+    seed: int,
+) -> tuple[OpenArea, dict[str, Any], float]:
+    """The area, the values that the seed draws for a turn by the clock, and a time after it [s].
+
+    ``steering_time`` is the name of the time in which the angle is reached.
+    """
+    draw = Draws(seed)
+    speed = min(draw(manoeuvre.speed), FASTEST_SHARE * car.top_speed)
+    severity = draw(manoeuvre.severity)
+    steering = draw(getattr(manoeuvre, steering_time))
+    after = draw(time_after)
+    side = draw.side(manoeuvre.side)
+    begin = draw((1.0, 2.0))
+    area = OpenArea(surface, seed)
+    drawn = {
+        "speed": speed,
+        "severity": severity,
+        "steer": side * _steer_at(car, severity, speed, area.mean),
+        "begin": begin,
+        steering_time: steering,
+        "side": SIDES[side],
+    }
+    return area, drawn, after
 
 
 def _steer_at(car: Car, severity: float, speed: float, friction: float) -> float:

@@ -53,6 +53,7 @@ from vehest.simulation.plant.regimes import (
     WHEEL_RELAXATION,
     YAW,
     YAW_RATE,
+    kernel,
     next_regime,
     slow_motion,
     wheel_velocities,
@@ -89,15 +90,6 @@ LARGEST_LOAD_FACTOR = 1.5
 is that of braking.
 """
 
-# As in NumPy, a division by zero gives an infinite value, which the plant reports. Wrappers for
-# Python, which unpack tuples of a hundred
-# numbers, and references of arrays, counted in every function, would take almost half of the time
-# to compile.
-_kernel = numba.njit(
-    error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True, _nrt=False
-)
-
-
 _N_STEERING = len(STEERING_NAMES)  # number of parameters of the steering
 _N_LONGITUDINAL = len(LONGITUDINAL_NAMES)  # number of parameters of the longitudinal dynamics
 _N_TYRE = len(TYRE_NAMES)  # number of parameters of a tyre
@@ -131,13 +123,13 @@ def _unpack(vector, friction):
     )
 
 
-@_kernel
+@kernel
 def _sliding_friction(tyre):
     """Lateral force over load of an upright wheel that slips at a right angle."""
     return abs(lateral_force(0.5 * math.pi, 0.0, 1.0, tyre)[0])
 
 
-@_kernel
+@kernel
 def _right_hand_side(x, contact, p, derivatives):
     """Fill the derivatives (29,) of the state; return the twelve tyre forces in the library's order
     and the wheels' axes.
@@ -180,7 +172,7 @@ def _right_hand_side(x, contact, p, derivatives):
     return forces
 
 
-@_kernel
+@kernel
 def _engine_limit(x, acceleration, p):
     """Wanted longitudinal acceleration [m/s²], limited by power at the speed of the driven wheels;
     the library's limit takes the car's speed.
@@ -196,13 +188,13 @@ def _engine_limit(x, acceleration, p):
     )
 
 
-@_kernel
+@kernel
 def _brake_arm(p):
     """Yaw moment per braking force on one side, shared equally by front and rear [m]."""
     return 0.25 * (p.T_f + p.T_r)
 
 
-@_kernel
+@kernel
 def _yaw_moment(moment, forces, p):
     """Wanted yaw moment [N m], limited by the friction of the braked side's loads."""
     left = p.tire.p_dx1 * forces[8] + p.tire_rear.p_dx1 * forces[10]
@@ -211,7 +203,7 @@ def _yaw_moment(moment, forces, p):
     return min(max(moment, -left * _brake_arm(p)), right * _brake_arm(p))
 
 
-@_kernel
+@kernel
 def _n_substeps(regime, x, p, step):
     """Number of parts of a step in which the slip of the slowest wheel is stable."""
     if regime != ROLLING:
@@ -224,7 +216,7 @@ def _n_substeps(regime, x, p, step):
     return math.ceil(step / (per_velocity * max(slowest, SMALLEST_WHEEL_VELOCITY)))
 
 
-@_kernel
+@kernel
 def _relax(lateral_ratio, regime, forces, x, vector, part):
     """Lateral forces over load after a part of a step: while rolling they follow the slip over a
     length of the way.

@@ -25,8 +25,6 @@ from __future__ import annotations
 import math
 from collections import namedtuple
 
-import numba
-
 from vehest.constants import GRAVITY
 from vehest.simulation.plant.regimes import (
     FIRST_WHEEL,
@@ -43,6 +41,7 @@ from vehest.simulation.plant.regimes import (
     YAW,
     YAW_RATE,
     forces_of_contact,
+    kernel,
     wheel_velocities,
 )
 
@@ -74,12 +73,8 @@ _Wheels = namedtuple(
     "_Wheels", "along_left along_right across_left across_right load_left load_right"
 )
 
-_kernel = numba.njit(
-    error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True, _nrt=False
-)
 
-
-@_kernel
+@kernel
 def steering_limit(steer, velocity, limits):
     """Steering velocity [rad/s] within its limits; zero at the stops."""
     if (steer <= limits.min and velocity <= 0.0) or (steer >= limits.max and velocity >= 0.0):
@@ -87,7 +82,7 @@ def steering_limit(steer, velocity, limits):
     return min(max(velocity, limits.v_min), limits.v_max)
 
 
-@_kernel
+@kernel
 def acceleration_limit(velocity, acceleration, limits):
     """Longitudinal acceleration [m/s²] within brakes, engine power and top speed."""
     if (velocity <= limits.v_min and acceleration <= 0.0) or (
@@ -100,7 +95,7 @@ def acceleration_limit(velocity, acceleration, limits):
     return min(max(acceleration, -limits.a_max), max_acceleration)
 
 
-@_kernel
+@kernel
 def _bent(stiffness, curvature, slip):
     """atan(B s - E (B s - atan(B s))), whose sine or cosine the magic formula takes, times the
     shape factor.
@@ -109,7 +104,7 @@ def _bent(stiffness, curvature, slip):
     return math.atan(product - curvature * (product - math.atan(product)))
 
 
-@_kernel
+@kernel
 def longitudinal_force(slip, camber, load, tyre):
     """Longitudinal force of pure slip [N]. The published model has the vertical shift inside of the
     sine.
@@ -121,7 +116,7 @@ def longitudinal_force(slip, camber, load, tyre):
     )
 
 
-@_kernel
+@kernel
 def lateral_force(angle, camber, load, tyre):
     """Lateral force of pure slip [N], and its friction. Both shifts change sign with the camber."""
     side = 1.0 if camber > 0.0 else (-1.0 if camber < 0.0 else 0.0)
@@ -133,14 +128,14 @@ def lateral_force(angle, camber, load, tyre):
     return peak * math.sin(tyre.p_cy1 * _bent(stiffness, tyre.p_ey1, shifted)) + shift, friction
 
 
-@_kernel
+@kernel
 def _weighted(force, shape, stiffness, curvature, shift, slip):
     """A force of pure slip [N], reduced by slip in the other direction."""
     at_none = math.cos(shape * _bent(stiffness, curvature, shift)) if shift != 0.0 else 1.0
     return force / at_none * math.cos(shape * _bent(stiffness, curvature, slip + shift))
 
 
-@_kernel
+@kernel
 def _tyre_forces(slip, angle, camber, load, tyre):
     """Longitudinal and lateral force of a wheel with combined slip [N]."""
     along = longitudinal_force(slip, camber, load, tyre)
@@ -159,7 +154,7 @@ def _tyre_forces(slip, angle, camber, load, tyre):
     return _weighted(along, tyre.r_cx1, stiffness_along, tyre.r_ex1, tyre.r_hx1, angle), across
 
 
-@_kernel
+@kernel
 def _axles(p):
     """Parameters of the front and of the rear axle, as `_Axle`."""
     twice_wheelbase = 2.0 * (p.a + p.b)
@@ -197,7 +192,7 @@ def _axles(p):
     )
 
 
-@_kernel
+@kernel
 def _suspension(x, axle, height, radius, joint_spring, joint_damper):
     """Forces between an axle and the body, whose centre of gravity is at ``height`` at rest; bump
     stops are left out.
@@ -239,7 +234,7 @@ def _suspension(x, axle, height, radius, joint_spring, joint_damper):
     )
 
 
-@_kernel
+@kernel
 def _slip(velocity, turning):
     """Longitudinal slip of a wheel from its velocity and that of its rim [m/s]; a wheel that moves
     backwards counts as standing still.
@@ -250,7 +245,7 @@ def _slip(velocity, turning):
     return (forward - turning) / SMALLEST_WHEEL_VELOCITY
 
 
-@_kernel
+@kernel
 def _wheels(x, axle, suspension, steer, left_slip, right_slip, radius, vertical, tyre):
     """Tyre forces and loads of an axle; ``vertical`` is the vertical stiffness of a tyre [N/m]."""
     roll = x[axle.vy - 2]
@@ -277,7 +272,7 @@ def _wheels(x, axle, suspension, steer, left_slip, right_slip, radius, vertical,
     return _Wheels(along_left, along_right, across_left, across_right, load_left, load_right)
 
 
-@_kernel
+@kernel
 def _axle_rates(x, axle, suspension, across, left, right, radius, compliance, derivatives):
     """Fill the derivatives of an axle's five states and its joint's play.
 
@@ -312,7 +307,7 @@ def _axle_rates(x, axle, suspension, across, left, right, radius, compliance, de
     derivatives[axle.joint] = suspension.joint_rate
 
 
-@_kernel
+@kernel
 def multi_body(x, steering_velocity, acceleration, contact, p, derivatives):
     """Fill the derivatives (29,) of the state x (29,); returns twelve tyre forces in the wheels'
     axes: four along, four across, four loads.

@@ -65,12 +65,7 @@ HEAVE_FRONT = 16  # index of the front axle's heave in the state vector
 HEAVE_REAR = 21  # index of the rear axle's heave in the state vector
 # indices of the library's wheels (left front, right front, left rear, right rear) in the order of
 # `motion.WHEELS`
-MIRRORED = (
-    1,
-    0,
-    3,
-    2,
-)
+MIRRORED = (1, 0, 3, 2)
 
 # quantity -> its index in the state vector
 PLACES = {"x": X, "y": Y, "yaw": YAW, "vx": VX, "vy": VY, "yaw_rate": YAW_RATE, "steer": STEER}
@@ -155,12 +150,9 @@ class MultiBodyPlant:
         """The state in which the springs carry the car, at the origin; (29,)."""
         p = self.parameters
         values = np.zeros(compiled.N_STATES)
-        values[HEAVE_FRONT] = (p.m_s * GRAVITY * p.b / (p.a + p.b) + p.m_uf * GRAVITY) / (
-            2.0 * p.K_zt
-        )
-        values[HEAVE_REAR] = (p.m_s * GRAVITY * p.a / (p.a + p.b) + p.m_ur * GRAVITY) / (
-            2.0 * p.K_zt
-        )
+        for place, lever, unsprung in ((HEAVE_FRONT, p.b, p.m_uf), (HEAVE_REAR, p.a, p.m_ur)):
+            load = p.m_s * GRAVITY * lever / (p.a + p.b) + unsprung * GRAVITY
+            values[place] = load / (2.0 * p.K_zt)
         values[PITCH] = (values[HEAVE_REAR] - values[HEAVE_FRONT]) / self.wheelbase
         values[HEAVE] = values[HEAVE_FRONT] + p.a * values[PITCH]
         return values

@@ -105,10 +105,10 @@ class Vehicle:
     def __post_init__(self) -> None:
         parameters = library_parameters(self)
         for name in POSITIVE:
-            if not getattr(parameters, name) > 0.0:
+            value = getattr(parameters, name)
+            if not value > 0.0:
                 raise ConfigurationError(
-                    f"vehicle '{self.name}': {name} must be positive, not "
-                    f"{getattr(parameters, name)}"
+                    f"vehicle '{self.name}': {name} must be positive, not {value}"
                 )
         rear_tyre(self)
         for place, length in zip(("front", "rear"), self.relaxation, strict=True):
@@ -214,10 +214,8 @@ def library_parameters(vehicle: Vehicle) -> VehicleParameters:
             f"{vehicle.parameter_set}; there are {published_sets}"
         )
     parameters = deepcopy(_published(vehicle.parameter_set))
-    library_overrides = {
-        name: value for name, value in vehicle.overrides.items() if name != REAR_TYRE
-    }
-    _override(parameters, library_overrides, vehicle.name, prefix="")
+    overrides = {name: value for name, value in vehicle.overrides.items() if name != REAR_TYRE}
+    _override(parameters, overrides, vehicle.name, prefix="")
     return parameters
 
 
@@ -269,10 +267,10 @@ def _override(
     """
     for name, value in overrides.items():
         label = f"vehicle '{vehicle_name}': override '{prefix}{name}'"
-        if name not in _field_names(type(parameters)):
-            names = ", ".join(_field_names(type(parameters)))
+        names = _field_names(type(parameters))
+        if name not in names:
             raise ConfigurationError(
-                f"{label} names no parameter of the plant; known ones: {names}"
+                f"{label} names no parameter of the plant; known ones: {', '.join(names)}"
             )
         is_group = is_dataclass(getattr(parameters, name))
         if is_group != isinstance(value, Mapping):
@@ -281,20 +279,15 @@ def _override(
             )
         if is_group:
             _override(getattr(parameters, name), value, vehicle_name, prefix=f"{prefix}{name}.")
-            continue
-        _require_number(label, value)
-        setattr(parameters, name, float(value))
+        elif is_number(value):
+            setattr(parameters, name, float(value))
+        else:
+            raise ConfigurationError(f"{label} must be a finite number, not {value!r}")
 
 
 def is_number(value: Any) -> bool:
     """Whether a value is a finite number, not a truth value."""
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-
-
-def _require_number(label: str, value: Any) -> None:
-    """Raise `ConfigurationError` for a value that is no finite number."""
-    if not is_number(value):
-        raise ConfigurationError(f"{label} must be a finite number, not {value!r}")
 
 
 def _values_of(parameters: Any, names: Sequence[str]) -> list[float]:

@@ -64,12 +64,16 @@ VY_REAR = 20  # index of the rear axle's lateral velocity in it
 # names
 FIRST_WHEEL = 23
 
-_kernel = numba.njit(
-    error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True, _nrt=False
-)
+kernel = numba.njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True, _nrt=False)
+"""Decorator of functions that compiled code alone calls.
+
+As in NumPy, a division by zero gives an infinite value, which the plant reports. Wrappers for
+Python, which unpack tuples of a hundred numbers, and references of arrays, counted in every
+function, would take almost half of the time to compile.
+"""
 
 
-@_kernel
+@kernel
 def next_regime(regime, x, p):
     """The regime that holds from the state x on."""
     vx = x[VX]
@@ -90,7 +94,7 @@ def next_regime(regime, x, p):
     return regime
 
 
-@_kernel
+@kernel
 def slow_motion(x, steering_velocity, acceleration, inputs, p):
     """Derivatives of vx, vy and yaw rate of a car that rolls without slip; it stands where brakes
     or a slope hold it.
@@ -114,7 +118,7 @@ def slow_motion(x, steering_velocity, acceleration, inputs, p):
     )
 
 
-@_kernel
+@kernel
 def wheel_velocities(x, p):
     """Velocity of the four wheels along their own planes, in the library's order [m/s]."""
     sine = math.sin(x[STEER])
@@ -130,7 +134,7 @@ def wheel_velocities(x, p):
     )
 
 
-@_kernel
+@kernel
 def forces_of_contact(contact, x, u, p, along, across, loads):
     """Longitudinal and lateral forces of the four tyres in the wheels' axes.
 
@@ -193,7 +197,7 @@ def forces_of_contact(contact, x, u, p, along, across, loads):
     )
 
 
-@_kernel
+@kernel
 def _adhesion(p, front_share):
     """Largest acceleration [m/s²] whose torque, split in this way, neither axle's static load fails
     to carry.
@@ -204,7 +208,7 @@ def _adhesion(p, front_share):
     return SLOW_ADHESION * GRAVITY * min(front, rear)
 
 
-@_kernel
+@kernel
 def _forces_needed(x, u, inputs, p):
     """Forces on front and rear axle, along and across the body, that `slow_motion` needs."""
     vx_change, vy_change, yaw_acceleration = slow_motion(x, u[0], u[1], inputs, p)
@@ -221,7 +225,7 @@ def _forces_needed(x, u, inputs, p):
     )
 
 
-@_kernel
+@kernel
 def _coulomb(limit, vx, vy):
     """Force of sliding friction (along, across) against a velocity, of magnitude ``limit`` [N]
     beyond SLIDING_SMOOTHING.

@@ -13,8 +13,7 @@ from pydantic import Field
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError
 from vehest.data.schema import validated
-
-_STREAM = 2  # random stream of the surface in a drive's seed; 0 is the driver's, 1 the sensors'
+from vehest.simulation.random_streams import SURFACE, random_stream
 
 
 @dataclass(frozen=True)
@@ -81,9 +80,7 @@ class Surface:
 
     def _draw(self, around: float, seed: int) -> tuple[FloatArray, FloatArray]:
         """Ends [m] and scales of the patches of one lap; the last one is as long as it must be."""
-        generator = np.random.default_rng(
-            np.random.SeedSequence(entropy=seed, spawn_key=(_STREAM,))
-        )
+        generator = random_stream(seed, SURFACE)
         low = self.friction if self.patches is None else self.patches
         ends = np.cumsum(
             generator.uniform(*self.patch_length, math.ceil(around / self.patch_length[0]) + 1)

@@ -11,9 +11,8 @@ import numpy as np
 from scipy import signal
 
 from vehest.constants import FloatArray
+from vehest.simulation.random_streams import SENSORS, random_stream
 from vehest.simulation.sensors.levels import SensorLevel
-
-STREAM = 1  # first spawn key of all sensor errors; 0 is the driver's
 
 
 def sensor_signal(
@@ -64,9 +63,7 @@ def sensor_signal(
 
 def stream(seed: int, name: str) -> np.random.Generator:
     """The random stream of one error of one sensor in one drive, independent of other errors."""
-    return np.random.default_rng(
-        np.random.SeedSequence(entropy=seed, spawn_key=(STREAM, zlib.crc32(name.encode())))
-    )
+    return random_stream(seed, SENSORS, zlib.crc32(name.encode()))
 
 
 def delayed(samples: FloatArray, delay: float) -> FloatArray:

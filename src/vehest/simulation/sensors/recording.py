@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from vehest.constants import GRAVITY, FloatArray
+from vehest.data.derived import derivative
 from vehest.simulation.plant.motion import WHEELS, Motion
 from vehest.simulation.sensors.errors import sensor_signal, stream
 from vehest.simulation.sensors.levels import Reference, SensorLevels, Tilt, Vibration
@@ -181,20 +182,15 @@ def _inertial(motion: Motion, levels: SensorLevels, seed: int) -> dict[str, Floa
     force = specific_force(motion, levels.tilt)
     lever = np.array([[mounting.lever_x], [mounting.lever_y], [mounting.lever_z]])
     if lever.any():  # dω/dt × l + ω × (ω × l), as of a rigid body
-        angular = (
-            np.gradient(rates, axis=1) * motion.rate_hz
-            if rates.shape[1] > 1
-            else np.zeros_like(rates)
-        )
+        angular = np.stack([derivative(rate, motion.rate_hz) for rate in rates])
         force = force + (
             np.cross(angular, lever, axis=0)
             + np.cross(rates, np.cross(rates, lever, axis=0), axis=0)
         )
     angles = np.array([mounting.roll, mounting.pitch, mounting.yaw])
     if mounting.misalignment:
-        angles = angles + mounting.misalignment * stream(seed, "imu.misalignment").standard_normal(
-            3
-        )
+        errors = stream(seed, "imu.misalignment").standard_normal(3)
+        angles = angles + mounting.misalignment * errors
     roll_rate, pitch_rate, yaw_rate = _turned(rates, *angles)
     ax, ay, _ = _turned(force, *angles)
     true_signals = {
@@ -204,13 +200,11 @@ def _inertial(motion: Motion, levels: SensorLevels, seed: int) -> dict[str, Floa
         "ax": ax,
         "ay": ay,
     }
-    for name in ("yaw_rate", "ax", "ay"):
-        by_speed = getattr(levels.vibration, name)
+    for name, by_speed in vars(levels.vibration).items():
         if by_speed:
             shaking = stream(seed, f"vibration.{name}").standard_normal(len(motion))
-            true_signals[name] = (
-                true_signals[name] + by_speed * np.abs(motion.wheel_speed.mean(axis=1)) * shaking
-            )
+            size = by_speed * np.abs(motion.wheel_speed.mean(axis=1))
+            true_signals[name] = true_signals[name] + size * shaking
     return true_signals
 
 
@@ -242,23 +236,21 @@ def _reference(motion: Motion, reference: Reference, seed: int) -> dict[str, Flo
     heading = sensor_signal(np.zeros(len(motion)), reference.heading, rate_hz, seed, "heading_ref")
     cosine = np.cos(heading)
     sine = np.sin(heading)
-    yaw_rate = sensor_signal(motion.yaw_rate, reference.yaw_rate, rate_hz, seed, "yaw_rate_ref")
-    forward_signal = sensor_signal(
-        forward * cosine + left * sine, reference.vx, rate_hz, seed, "vx_ref"
+    true = {
+        "yaw_rate": motion.yaw_rate,
+        "vx": forward * cosine + left * sine,
+        "vy": left * cosine - forward * sine,
+    }
+    yaw_rate, forward_signal, left_signal = (
+        sensor_signal(values, getattr(reference, name), rate_hz, seed, f"{name}_ref")
+        for name, values in true.items()
     )
-    left_signal = sensor_signal(
-        left * cosine - forward * sine, reference.vy, rate_hz, seed, "vy_ref"
-    )
-    lever_x = reference.lever_x
-    lever_y = reference.lever_y
+    lever = np.array([reference.lever_x, reference.lever_y])
     if reference.lever_error:
-        error_x, error_y = reference.lever_error * stream(
-            seed, "reference.lever_error"
-        ).standard_normal(2)
-        lever_x = lever_x + error_x
-        lever_y = lever_y + error_y
-    vx = forward_signal + yaw_rate * lever_y
-    vy = left_signal - yaw_rate * lever_x
+        errors = stream(seed, "reference.lever_error").standard_normal(2)
+        lever = lever + reference.lever_error * errors
+    vx = forward_signal + yaw_rate * lever[1]
+    vy = left_signal - yaw_rate * lever[0]
     return {
         "vx_ref": vx,
         "vy_ref": vy,

@@ -178,14 +178,11 @@ class CanSource(SignalSource):
                 text = never_occurs(file, name, described, len(stamps[name]), bus)
                 raise DataError(text + others)
             times = np.array(stamps[name])
-            location = (
-                f"'{file}': message '{described.message.name}', which carries '{described.signal}',"
-            )
-            require_clock(times, location, "cut the log there, or leave repeated frames out")
             origin = f"message '{described.message.name}'"
-            signals[name] = Signal(
-                origin, times, np.array(values[name]), described.message.units[described.signal]
-            )
+            location = f"'{file}': {origin}, which carries '{described.signal}',"
+            require_clock(times, location, "cut the log there, or leave repeated frames out")
+            unit = described.message.units[described.signal]
+            signals[name] = Signal(origin, times, np.array(values[name]), unit)
             rates[described.message.name] = round(signals[name].rate_hz, 3)
         left_out = {MISSING: {"": [f"not read: {frames.cut_end}"]}} if frames.cut_end else {}
         return signals, {"dbc": self.dbc.name, "messages": rates, **left_out}

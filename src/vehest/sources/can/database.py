@@ -67,18 +67,16 @@ class Message:
         for coder in self.coders:
             try:
                 values = coder.decode(frame, decode_choices=False)
-            except (
-                Exception
-            ):  # of cantools, for a multiplexer's value that the signal does not go with
+            # of cantools, for a multiplexer's value that the signal does not go with
+            except Exception:
                 continue
             decoded |= {name: float(value) for name, value in values.items() if name in self.units}
         return decoded
 
     def physical(self, signal: str, raw: int) -> float:
         """A raw value of a signal in the unit of the DBC: scaled and shifted, not named."""
-        return float(
-            self.described.get_signal_by_name(signal).raw_to_scaled(raw, decode_choices=False)
-        )
+        described = self.described.get_signal_by_name(signal)
+        return float(described.raw_to_scaled(raw, decode_choices=False))
 
     def not_measured(self, signal: str) -> frozenset[float]:
         """Values, in the unit of the DBC, whose names say that nothing was measured.
@@ -205,12 +203,8 @@ def read_database(file: Path, selected: Sequence[str]) -> Database:
     for message, _ in chosen.values():
         key = _identifier(message)
         if key not in messages:
-            names = list(
-                dict.fromkeys(
-                    signal for candidate, signal in chosen.values() if candidate is message
-                )
-            )
-            messages[key] = message_of(message, names, file)
+            names = [signal for candidate, signal in chosen.values() if candidate is message]
+            messages[key] = message_of(message, list(dict.fromkeys(names)), file)
         elif messages[key].described is not message:
             raise DataError(
                 f"'{file}': two messages have the identifier {message.frame_id:#x}; remove one"
@@ -268,15 +262,8 @@ def message_of(message: Any, selected: Sequence[str], file: Path) -> Message:
                     f"{signal.offset}; correct the DBC"
                 )
         try:
-            coders.append(
-                Coder(
-                    message.frame_id,
-                    message.name,
-                    message.length,
-                    parts,
-                    is_extended_frame=message.is_extended_frame,
-                )
-            )
+            identity = message.frame_id, message.name, message.length
+            coders.append(Coder(*identity, parts, is_extended_frame=message.is_extended_frame))
         except Exception as error:  # of cantools
             raise DataError(
                 f"{location} cannot be decoded ({printable(first_line(error))})"

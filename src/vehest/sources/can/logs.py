@@ -45,14 +45,14 @@ class Frames:
             for time, identifier, extended, fd, fast, length, bus in zip(
                 *(self.arrays[name][rows].tolist() for name in names), strict=True
             ):
-                kinds = {"is_fd": bool(fd), "bitrate_switch": bool(fast)}
                 yield Message(
                     time,
                     identifier,
                     bool(extended),
                     channel=self.buses[bus],
                     data=bytes(data[at : at + length]),
-                    **kinds,
+                    is_fd=bool(fd),
+                    bitrate_switch=bool(fast),
                 )
                 at += length
 

@@ -289,16 +289,11 @@ def _connections(bag: Path, reader: Reader, types: Any, name: str, kind: str) ->
     """
     connections = [connection for connection in reader.connections if connection.topic == name]
     if not any(connection.msgcount for connection in connections):
-        topics = printable(
-            ", ".join(
-                sorted(
-                    {connection.topic for connection in reader.connections if connection.msgcount}
-                )[:30]
-            )
-        )
+        names = {connection.topic for connection in reader.connections if connection.msgcount}
+        topics = printable(", ".join(sorted(names)[:30])) or "none"
         raise DataError(
-            f"'{bag}' holds no messages of topic '{name}' (of {topics or 'none'}); correct topics "
-            "in the configuration"
+            f"'{bag}' holds no messages of topic '{name}' (of {topics}); correct topics in the "
+            "configuration"
         )
     for connection in connections:
         if connection.msgtype != kind:

@@ -70,11 +70,9 @@ def read_frames(
         The log is truncated, holds no frame, more than the limits allow, or one at no time of a
         drive.
     """
-    identifiers_read = (
-        None
-        if selected is None
-        else {(int(identifier), bool(extended)) for identifier, extended in selected}
-    )
+    identifiers_read = {
+        (int(identifier), bool(extended)) for identifier, extended in selected or ()
+    }
     times = array("d")
     identifiers = array("L")
     buses = array("L")
@@ -98,10 +96,8 @@ def read_frames(
                     f"'{file}': frame {count} is stamped {frame.timestamp:.6g} s; the file is "
                     "damaged"
                 )
-            if (
-                identifiers_read is not None
-                and (frame.arbitration_id, frame.is_extended_id) not in identifiers_read
-            ):
+            identifier = frame.arbitration_id, frame.is_extended_id
+            if selected is not None and identifier not in identifiers_read:
                 continue
             times.append(frame.timestamp)
             identifiers.append(frame.arbitration_id)
@@ -115,25 +111,23 @@ def read_frames(
         cut_line = printable(getattr(reader.file, "cut_line", "").strip()[:60])
     if not count:
         raise DataError(f"'{file}' holds no frame; is it a log of a bus?")
-    arrays = {
-        name: np.frombuffer(values, np.uint8) for name, values in {**flags, "data": data}.items()
-    }
+    arrays = {"time": times, "identifier": identifiers, "bus": buses}
+    octets = {**flags, "data": data}
     return {
-        "time": np.array(times),
-        "identifier": np.array(identifiers),
-        "bus": np.array(buses),
-        **arrays,
+        **{name: np.array(values) for name, values in arrays.items()},
+        **{name: np.frombuffer(values, np.uint8) for name, values in octets.items()},
     }, {"buses": list(numbers), "cut_line": cut_line}
 
 
 def _opened(file: Path) -> Any:
     """A reader; texts are opened here, since their comments are of any encoding."""
-    if file.suffix.lower() == ".blf":
-        return BLFReader(file)
-    if file.suffix.lower() == ".asc":
-        return ASCReader(_VectorText(file))
-    if file.suffix.lower() == ".trc":
-        return TRCReader(_LogText(file))
+    match file.suffix.lower():
+        case ".blf":
+            return BLFReader(file)
+        case ".asc":
+            return ASCReader(_VectorText(file))
+        case ".trc":
+            return TRCReader(_LogText(file))
     return CanutilsLogReader(_CandumpText(file))
 
 

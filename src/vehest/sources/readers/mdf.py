@@ -21,7 +21,7 @@ from asammdf.blocks import v2_v3_constants as v3
 from asammdf.blocks import v4_constants as v4
 
 from vehest.constants import FloatArray
-from vehest.data.errors import DataError, printable, suggestion
+from vehest.data.errors import DataError, first_of, printable, suggestion
 from vehest.data.limits import check_limit
 from vehest.sources.limited import Arrays
 from vehest.sources.not_measured import marks_not_measured
@@ -94,9 +94,8 @@ def read(
                 "format, or compressed?"
             )
         stream.seek(0)
-        content = (
-            io.BytesIO(stream.read()) if head.startswith(UNFINISHED) else stream
-        )  # which asammdf completes in place
+        # an unfinished file is completed by asammdf in place
+        content = io.BytesIO(stream.read()) if head.startswith(UNFINISHED) else stream
         try:
             measurement = asammdf.MDF(content, **OPTIONS)
         except Exception as error:
@@ -113,14 +112,9 @@ def read(
         arrays: Arrays = {}
         skipped: list[str] | None = [] if requests is None else None
         for group in dict.fromkeys(group for group, _ in places.values()):
+            indices = {key: index for key, (at, index) in places.items() if at == group}
             with _or_skip(skipped, file):
-                arrays |= _group_of(
-                    measurement,
-                    group,
-                    {key: index for key, (at, index) in places.items() if at == group},
-                    file,
-                    skipped,
-                )
+                arrays |= _group_of(measurement, group, indices, file, skipped)
         signals = {}
         for key, (group, index) in places.items():
             if key in arrays:
@@ -313,7 +307,7 @@ def _place_of(
         if group is None or group in (place[0], _group_name(measurement, place[0]))
     ]
     titles = list(dict.fromkeys(_title(measurement, g) for g, _ in matching or candidates))
-    groups = ", ".join(titles[:12]) + (", …" if len(titles) > 12 else "")
+    groups = first_of(titles, 12)
     if not matching:
         raise DataError(
             f"'{file}': signal '{name}' is not in group '{group}', but in {groups}; correct group"
@@ -394,15 +388,13 @@ def _require_number(measurement: Any, group: int, index: int, location: str) -> 
         )
     if channel.conversion_addr and channel.conversion is None:  # asammdf would give the raw numbers
         raise DataError(f"{location} has a conversion that cannot be read; the file is damaged")
-    if measurement.version >= "4":
-        virtual = channel.channel_type in (v4.CHANNEL_TYPE_VIRTUAL, v4.CHANNEL_TYPE_VIRTUAL_MASTER)
-        end = 0 if virtual else 8 * channel.byte_offset + channel.bit_offset + channel.bit_count
+    if measurement.version < "4":
+        first = 8 * getattr(channel, "additional_byte_offset", 0) + channel.start_offset
+        end = first + channel.bit_count
+    elif channel.channel_type in (v4.CHANNEL_TYPE_VIRTUAL, v4.CHANNEL_TYPE_VIRTUAL_MASTER):
+        end = 0
     else:
-        end = (
-            8 * getattr(channel, "additional_byte_offset", 0)
-            + channel.start_offset
-            + channel.bit_count
-        )
+        end = 8 * channel.byte_offset + channel.bit_offset + channel.bit_count
     marked = getattr(channel, "flags", 0) & v4.FLAG_CN_INVALIDATION_PRESENT
     outside = marked and channel.pos_invalidation_bit >= 8 * _invalidation_bytes(described)
     if outside or end > 8 * described.channel_group.samples_byte_nr:
@@ -425,15 +417,13 @@ def _physical(raw: np.ndarray, invalid: Any, conversion: Any, location: str) -> 
         physical = physical.astype(np.float64)
     if conversion is not None and len(physical):
         with np.errstate(all="ignore"):
-            ranges = (
+            if (
                 type(conversion) is v4_blocks.ChannelConversion
                 and conversion.conversion_type == v4.CONVERSION_TYPE_RTAB
-            )
-            physical = (
-                _of_ranges(physical, conversion)
-                if ranges
-                else conversion.convert(physical, as_object=True)
-            )
+            ):
+                physical = _of_ranges(physical, conversion)
+            else:
+                physical = conversion.convert(physical, as_object=True)
     if physical.dtype.kind == "O":  # numbers with texts among them, as a conversion gives them
         physical = np.array([_measured(value) for value in physical], dtype=object)
     if physical.dtype.kind in "SU" or (
@@ -467,10 +457,8 @@ def _of_ranges(raw: np.ndarray, conversion: Any) -> FloatArray:
     )
     lower, upper, physical = rows.reshape(-1, 3).T
     at = np.maximum(np.searchsorted(lower, raw, side="right") - 1, 0)
-    inside = (lower[at] <= raw) & (
-        (raw < upper[at]) if raw.dtype.kind == "f" else (raw <= upper[at])
-    )
-    return np.where(inside, physical[at], conversion.default)
+    is_below = raw < upper[at] if raw.dtype.kind == "f" else raw <= upper[at]
+    return np.where((lower[at] <= raw) & is_below, physical[at], conversion.default)
 
 
 def _group_name(measurement: Any, group: int) -> str:

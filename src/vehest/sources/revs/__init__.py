@@ -155,13 +155,9 @@ class RevsSource(FileSource):
         )
         if self.options.units_row == "check":
             for name, column in self.columns.items():
-                require_unit(
-                    units[column.column],
-                    column,
-                    channel(name).unit,
-                    f"'{file}': column '{column.column}'",
-                    "set units_row: ignore",
-                )
+                location = f"'{file}': column '{column.column}'"
+                unit = channel(name).unit
+                require_unit(units[column.column], column, unit, location, "set units_row: ignore")
         return values, about
 
     def _read_text(self, files: Mapping[str, Path]) -> dict[str, FloatArray]:

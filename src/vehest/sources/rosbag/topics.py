@@ -150,11 +150,8 @@ def _decompress(path: Path, packed: Sequence[Path], folder: Path, most_bytes: in
                 while block := stream.read(1 << 20):
                     n_bytes += len(block)
                     if n_bytes > max_unpacked:
-                        remedy = (
-                            "raise unpacked_limit"
-                            if max_unpacked == most_bytes
-                            else "unpack it by hand"
-                        )
+                        is_limited = max_unpacked == most_bytes
+                        remedy = "raise unpacked_limit" if is_limited else "unpack it by hand"
                         raise DataError(
                             f"'{path}' would unpack to more than the limit of "
                             f"{max_unpacked / 1e9:.3g} GB; {remedy}"

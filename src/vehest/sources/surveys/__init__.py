@@ -167,7 +167,6 @@ def _survey(path: Path) -> Log:
 def _survey_bag(path: Path) -> Log:
     """Numbers in messages of ROS's own types, each field with the times of its messages."""
     arrays, about = read_bag(path, "survey_topics", ignored=IGNORED, most_fields=MOST_FIELDS)
-    columns = []
     clocks = _clocks_of_topics(arrays, [name for name, *_ in about["topics"]])
     times = {
         name: arrays[f"{name}@{'stamped' if clock == 'header' else clock}"].astype(np.float64)
@@ -182,20 +181,19 @@ def _survey_bag(path: Path) -> Log:
         if clock == "received" and f"{name}@stamped" in arrays
     ]
     start = min((stamps[0] for stamps in times.values() if len(stamps) > 1), default=0.0)
-    for topic, kind, fields in about["topics"]:
-        for field in fields if len(times[topic]) > 1 else ():
-            unit = UNITS.get(kind, {}).get(field.rpartition(".")[0], "")
-            place = {"topic": topic, "type": kind, "stamps": clocks[topic], "field": field}
-            columns.append(
-                RawColumn(
-                    f"{topic} {field}",
-                    unit,
-                    arrays[f"{topic}.{field}"],
-                    place,
-                    times[topic] - start,
-                )
-            )
-    return Log(path, "rosbag", tuple(columns), skipped=tuple(skipped))
+    columns = tuple(
+        RawColumn(
+            f"{topic} {field}",
+            UNITS.get(kind, {}).get(field.rpartition(".")[0], ""),
+            arrays[f"{topic}.{field}"],
+            {"topic": topic, "type": kind, "stamps": clocks[topic], "field": field},
+            times[topic] - start,
+        )
+        for topic, kind, fields in about["topics"]
+        if len(times[topic]) > 1
+        for field in fields
+    )
+    return Log(path, "rosbag", columns, skipped=tuple(skipped))
 
 
 def _clocks_of_topics(

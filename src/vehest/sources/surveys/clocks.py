@@ -352,9 +352,8 @@ def _step(values: FloatArray, *, named: bool) -> float | None:
         return None
     steps = np.diff(values)
     grown = steps[steps > 0]
-    if (steps < 0).mean() > MOST_RESTARTS or len(grown) < 0.3 * len(
-        steps
-    ):  # stamps of too coarse a resolution repeat
+    # stamps of too coarse a resolution repeat
+    if (steps < 0).mean() > MOST_RESTARTS or len(grown) < 0.3 * len(steps):
         return None
     step = float(np.median(steps)) or float(grown.sum() / len(steps))
     grows = (
@@ -401,12 +400,11 @@ def _stamps(name: str, step: float, unit: str, named: bool, length: float) -> St
     chosen = chosen or ((slow or ["s"])[0] if named else "")
     if not chosen or step * STATED_UNITS[chosen] * HIGHEST_RATE < 1.0 - RATE_TOLERANCE:
         return None
-    rate = 1.0 / (step * STATED_UNITS[chosen])
-    evidence = f"grows evenly by {step:.6g}: {rate:.6g} Hz if in {chosen}"
+    evidence = f"grows evenly by {step:.6g}: {rates[chosen]:.6g} Hz if in {chosen}"
     if unit == chosen:
-        evidence = f"unit in the header, {rate:.6g} Hz"
+        evidence = f"unit in the header, {rates[chosen]:.6g} Hz"
     elif unit:
-        evidence += f", {1.0 / (step * STATED_UNITS[unit]):.6g} Hz in {unit}, as the header says"
+        evidence += f", {rates[unit]:.6g} Hz in {unit}, as the header says"
     is_asked = chosen not in fitting or unit not in ("", chosen)
     return Stamps(name, chosen, evidence, asked=is_asked, is_stated=bool(unit))
 
@@ -417,9 +415,8 @@ def _run_starts(
     """Where runs begin with the next row, (N - 1,), and the column that counts them, if one
     does.
     """
-    for name, starts in _counters(
-        columns, [name for name in columns if name != clock and COUNTER.match(plain_name(name))]
-    ):
+    counters = [name for name in columns if name != clock and COUNTER.match(plain_name(name))]
+    for name, starts in _counters(columns, counters):
         if 0 < starts.sum() <= MOST_RESTARTS * (len(steps) + 1):
             return starts, name
     breaks = (steps < 0) | (steps > LONG_GAP * step)

@@ -59,15 +59,11 @@ class Log:
     options: Mapping[str, Any] = field(default_factory=dict)
     # column of times; None where there is none, or where the format has times of its own
     clock: Stamps | None = None
-    seconds: FloatArray | None = (
-        # times of the rows [s], (N,), from the clock; None where columns have their own or there is
-        # no clock
-        None
-    )
-    runs: tuple[
-        slice, ...
-        # rows of each uninterrupted run, the longest first; one of all where times never restart
-    ] = ()
+    # times of the rows [s], (N,), from the clock; None where columns have their own or there is no
+    # clock
+    seconds: FloatArray | None = None
+    # rows of each uninterrupted run, the longest first; one of all where times never restart
+    runs: tuple[slice, ...] = ()
     skipped: tuple[str, ...] = ()  # parts that were not read, with the reason
     # rows of texts, from 1, such as repeated names; they are in no column
     repeated_names: tuple[int, ...] = ()

@@ -222,13 +222,14 @@ def survey_table(file: Path) -> Log:
         )
     written = {name: units.get(name) or unit_in_name(name) for name in values}
     times_and_values = clocks | values
-    if apart := times_apart(times_and_values, written | dict.fromkeys(clocks, "s")):
+    units_of_times = written | dict.fromkeys(clocks, "s")
+    if apart := times_apart(times_and_values, units_of_times):
         raise DataError(
             f"'{file}' has several columns of times, {listed(apart)}, which differ within a row by "
             f"more than {MAX_APART:g} s: its channels have clocks of their own; export it with one "
             "common column of times (resampled to one rate)"
         )
-    stamps, seconds, runs, cuts = find_clock(times_and_values, written | dict.fromkeys(clocks, "s"))
+    stamps, seconds, runs, cuts = find_clock(times_and_values, units_of_times)
     if stamps is not None and stamps.column in clocks:
         stamps = replace(
             stamps,
@@ -236,16 +237,13 @@ def survey_table(file: Path) -> Log:
             evidence=stamps.evidence.replace("unit in the header", "times of a clock"),
             asked=False,
         )
+    clock = None if stamps is None else stamps.column
     named = {
         name: times
         for name, times in values.items()
-        if stamps is None and NAMED.match(plain_name(name))
+        if clock is None and NAMED.match(plain_name(name))
     }
-    faults = [
-        _fault(name, times)
-        for name, times in (clocks | named).items()
-        if stamps is None or name != stamps.column
-    ]
+    faults = [_fault(name, times) for name, times in (clocks | named).items() if name != clock]
     rate_source = "a line above the names"
     for name, times in named.items():
         _require_rows_once(file, name, times, values)
@@ -271,15 +269,13 @@ def survey_table(file: Path) -> Log:
         rows = np.argsort(times_and_values[stamps.column], kind="stable")
         values = {name: samples[rows] for name, samples in values.items()}
     options |= cuts
-    beside = {stamps.column if stamps else None, cuts.get("runs")}
+    beside = {clock, cuts.get("runs")}
     columns = [
         RawColumn(name, written[name], samples, {"column": name})
         for name, samples in values.items()
         if name not in beside
     ]
-    is_text_log = {"rows_below_names", "missing"} & set(options) or (
-        stamps and stamps.unit == CLOCK
-    )
+    is_text_log = {"rows_below_names", "missing"} & set(options) or clock in clocks
     return Log(
         file,
         "text_log" if is_text_log else "tabular",
@@ -330,16 +326,10 @@ def _fault(name: str, times: FloatArray) -> str:
     steps = np.diff(times)
     back = (steps < 0).sum()
     n_repeats = (steps == 0).sum()
-    fault = (
-        f"goes backwards {back} times"
-        if back
-        else f"repeats {n_repeats} times"
-        if n_repeats
-        else "does not grow evenly"
-    )
-    return f"column '{printable(name)}' as the time: it {fault}" + (
-        "; sort the rows" if back > 1 else ""
-    )
+    fault = f"repeats {n_repeats} times" if n_repeats else "does not grow evenly"
+    if back:
+        fault = f"goes backwards {back} times" + ("; sort the rows" if back > 1 else "")
+    return f"column '{printable(name)}' as the time: it {fault}"
 
 
 def unit_in_name(name: str) -> str:
@@ -397,9 +387,8 @@ def shape_of(file: Path) -> Shape:
             cell for row in [*tables[";"].values(), *tables[","].values()][-40:] for cell in row
         ]
         kind = _kind_of_text(pa.chunked_array([cells], pa.string()))
-        why = "is it a table of text, with names in a line above the numbers?"
-        if kind != "text":
-            why = f"it holds {kind}"
+        advice = "is it a table of text, with names in a line above the numbers?"
+        why = advice if kind == "text" else f"it holds {kind}"
         raise DataError(f"'{file}' holds no rows of two numbers or more; {why}")
     if not best.names:
         raise DataError(f"'{file}' has no line of names above its first numbers; {best.fault}")
@@ -525,7 +514,8 @@ def _decoded(head: bytes, file: Path) -> tuple[str, str]:
         return "utf-16", head.decode("utf-16", errors="replace")
     if head.startswith(b"\x1f\x8b"):
         raise DataError(f"'{file}' is compressed by gzip; let its name end in '.csv.gz'")
-    if b"\0" in head or _count_controls(head) > MOST_CONTROLS * len(head):
+    n_controls = len(head) - len(head.translate(None, CONTROLS))
+    if b"\0" in head or n_controls > MOST_CONTROLS * len(head):
         raise DataError(
             f"'{file}' is no table of text (it holds control characters); save its channels as CSV"
         )
@@ -539,11 +529,6 @@ def _decoded(head: bytes, file: Path) -> tuple[str, str]:
             if name not in ENCODINGS or _has_words(text, *ENCODINGS[name][1:]):
                 return name, text
     return "latin-1", head.decode("latin-1")
-
-
-def _count_controls(head: bytes) -> int:
-    """Number of control characters that texts do not have."""
-    return len(head) - len(head.translate(None, CONTROLS))
 
 
 def _has_words(text: str, letter: str, min_share: float) -> bool:

@@ -73,21 +73,23 @@ def require_columns_of_signals(
             f"'{file}' is JSON; save a table with a row for each time and a column of each "
             "quantity, for example by pandas: json_normalize(…).to_csv('wide.csv')"
         )
-    if filled and all(map(_RECEIVER_MESSAGE.fullmatch, filled[:20])):
-        raise DataError(
-            f"'{file}' holds messages of a satellite receiver (NMEA or NovAtel's ASCII); convert "
+    kinds_of_lines = {
+        _RECEIVER_MESSAGE.fullmatch: (
+            "holds messages of a satellite receiver (NMEA or NovAtel's ASCII); convert "
             "them to a table with a column of each quantity, by the receiver's software"
-        )
-    if filled and all(map(_CANDUMP.match, filled[:20])):
-        raise DataError(
-            f"'{file}' holds raw frames of a CAN bus as candump writes them; name the DBC file of "
+        ),
+        _CANDUMP.match: (
+            "holds raw frames of a CAN bus as candump writes them; name the DBC file of "
             f"the bus behind it, as in: vehest new my_car {file.stem}.log car.dbc"
-        )
-    if filled and all(map(_LINE_PROTOCOL.fullmatch, filled[:20])):
-        raise DataError(
-            f"'{file}' is in InfluxDB's line protocol; export a table with a column of each field, "
+        ),
+        _LINE_PROTOCOL.fullmatch: (
+            "is in InfluxDB's line protocol; export a table with a column of each field, "
             "for example by a query that ends in pivot()"
-        )
+        ),
+    }
+    for matches, text in kinds_of_lines.items():
+        if filled and all(map(matches, filled[:20])):
+            raise DataError(f"'{file}' {text}")
     if filled and sum(map(bool, map(_ALIGNED.fullmatch, filled))) > 0.9 * len(filled):
         raise DataError(
             f"'{file}' has columns that are aligned by blanks; put one mark between them, "
