@@ -128,7 +128,7 @@ def _joined(errors: Sequence[BlockErrors]) -> BlockErrors:
 def _rows(part: str, candidate: str, test: str, metric: str, errors: BlockErrors) -> list[BlockRow]:
     rows = []
     for seed, sums in zip(errors.seeds, errors.sums, strict=True):
-        head = BlockRow(part, candidate, int(seed), test, metric, "", 0.0, 0)
+        head = BlockRow(part, candidate, int(seed), test, metric)
         rows += block_rows(head, errors.blocks, sums, errors.sizes)
     return rows
 
@@ -145,9 +145,7 @@ def measured_rows(claimed: Paper, parts: Mapping[str, Scheme]) -> list[BlockRow]
         if measured is None:
             continue
         for seed, values in enumerate(measured.values):
-            head = BlockRow(
-                claim.part, claim.candidate or "-", seed, claim.test_set, claim.id, "", 0.0, 0
-            )
+            head = BlockRow(claim.part, claim.candidate or "-", seed, claim.test_set, claim.id)
             rows += block_rows(head, measured.blocks, values, 1.0)
     return rows
 
@@ -166,7 +164,7 @@ def training_rows(
     """
     validation, doubled = _validation_errors(parts)
     rows = []
-    for candidate, declared in claimed.candidates.items():
+    for candidate in claimed.candidates:
         trained_as = candidate.removesuffix(CORRECTED)
         models = [
             model
@@ -198,12 +196,11 @@ def training_rows(
         if any(len(epochs_of_seeds) for epochs_of_seeds in stops):
             epochs = np.concatenate(stops)
             words += f", {epochs.min():.0f} to {epochs.max():.0f} by early stopping"
-        of_paper = "" if declared.epochs_paper is None else str(declared.epochs_paper)
         rows.append(
             checked_training(
                 candidate,
                 words,
-                of_paper,
+                claimed.epochs_of(candidate),
                 validation.get(category, {}),
                 doubled.get(category, {}),
             )
