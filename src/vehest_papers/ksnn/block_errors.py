@@ -24,6 +24,7 @@ from vehest_papers.kit.block_rows import (
     checked_training,
 )
 from vehest_papers.kit.claim_files import BASELINES, Paper
+from vehest_papers.kit.verdicts import keys_of
 from vehest_papers.ksnn import measures
 from vehest_papers.ksnn.behaviour import Behaviour
 from vehest_papers.ksnn.candidates import category_of, runs_of
@@ -75,9 +76,8 @@ def compared_candidates(claimed: Paper) -> dict[Comparison, list[str]]:
     compared: dict[Comparison, list[str]] = {}
     for claim in claimed.claims:
         if claim.kind in ("order", "equal", "limit"):
-            parts = [claim.part, claim.other_part or claim.part]
-            for part, candidate in zip(parts, claim.names, strict=False):
-                compared.setdefault((part, claim.test_set, claim.metric), []).append(candidate)
+            for key in keys_of(claim):
+                compared.setdefault((key.part, key.test_set, key.metric), []).append(key.candidate)
     for table in claimed.tables:
         for row in table.rows:
             compared.setdefault((table.part, table.test_set, row.metric), []).append(row.candidate)
