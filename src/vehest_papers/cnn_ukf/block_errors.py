@@ -34,6 +34,7 @@ from vehest_papers.kit.block_rows import (
     BlockRow,
     TrainingRow,
     checked_training,
+    name_in_blocks,
     seed_rows,
 )
 from vehest_papers.kit.claim_files import Paper
@@ -72,9 +73,7 @@ def error_rows(parts: Mapping[str, Runs], learnt: Limited | None, content: Paper
     comparisons = content.metrics()
     for part, runs in parts.items():
         compared = learnt.compared if part == LIMITED and learnt is not None else runs
-        declared = {
-            BASELINE_NAMES.get(name_in(part, name), name_in(part, name)): name for name in compared
-        }
+        declared = {name_in_blocks(name_in(part, name)): name for name in compared}
         errors = ManoeuvreErrors(compared)
         for name, candidate in declared.items():
             if name not in content.candidates:
@@ -83,7 +82,7 @@ def error_rows(parts: Mapping[str, Runs], learnt: Limited | None, content: Paper
                 if of_part != part or metric not in METRICS:
                     continue
                 of_candidate = errors.errors(candidate, METRICS[metric], GROUP_OF_TEST[test_set])
-                head = BlockRow(part, name, 0, test_set, metric, "", 0.0, 0)
+                head = BlockRow(part, name, 0, test_set, metric)
                 rows += seed_rows(
                     head,
                     errors.seeds(candidate),
@@ -101,7 +100,7 @@ def _pseudo_measurement_rows(learnt: Limited) -> list[BlockRow]:
     rows = []
     for candidate, seeds in learnt.outputs.items():
         squares, sizes = network_squares(seeds)
-        head = BlockRow(LIMITED, candidate, 0, TEST, PSEUDO, "", 0.0, 0)
+        head = BlockRow(LIMITED, candidate, 0, TEST, PSEUDO)
         names = learnt.comparison.manoeuvres
         rows += seed_rows(head, learnt.comparison.seeds(candidate), names, squares, sizes)
     return rows
@@ -182,7 +181,7 @@ def measured_rows(
             measures.largest_ratios_over_stiffnesses(conditions, paper.CNN, paper.DEEP)
         )
     for (claim, candidate), values in by_claim.items():
-        head = BlockRow(FULL, candidate, 0, TEST, claim, "", 0.0, 0)
+        head = BlockRow(FULL, candidate, 0, TEST, claim)
         rows += seed_rows(head, range(len(values)), main.manoeuvres, values)
     turns = (
         ("observable_while_steering", "steady_turns", False),
@@ -190,7 +189,7 @@ def measured_rows(
     )
     for claim, test_set, is_straight in turns if len(table) else ():
         names, values = measures.ranks(table, is_straight)
-        head = BlockRow("observability", "-", 0, test_set, claim, "", 0.0, 0)
+        head = BlockRow("observability", "-", 0, test_set, claim)
         rows += seed_rows(head, [0], names, values)
     return rows
 
@@ -200,9 +199,9 @@ def _rows_among_four(main: ManoeuvreErrors) -> list[BlockRow]:
     rivals = [name for name in paper.OF_FOUR if name != paper.CNN]
     rows = []
     for candidate in (paper.CNN, *(name for name in BASELINE_NAMES if name in main)):
-        named = BASELINE_NAMES.get(candidate, candidate)
+        named = name_in_blocks(candidate)
         values = measures.mean_error_over_least_of_others(main, candidate, rivals)
-        head = BlockRow(FULL, named, 0, TEST, "cnn_ukf_mean_error_nearest_zero", "", 0.0, 0)
+        head = BlockRow(FULL, named, 0, TEST, "cnn_ukf_mean_error_nearest_zero")
         rows += seed_rows(head, range(len(values)), main.manoeuvres, values)
         groups, values = measures.is_best_in_group(main, candidate, rivals)
         rows += seed_rows(
@@ -234,8 +233,7 @@ def training_rows(
             continue
         errors = _validation(runs)
         for candidate, seeds in runs.items():
-            called = name_in(part, candidate)
-            named = BASELINE_NAMES.get(called, called)
+            named = name_in_blocks(name_in(part, candidate))
             if named in rows or named not in content.candidates:
                 continue
             epochs = epochs_of(seeds[0].model)
@@ -244,12 +242,11 @@ def training_rows(
                     named, "", "", "not applicable", "nothing is learnt in epochs"
                 )
                 continue
-            of_paper = content.candidates[named].epochs_paper
             twice = doubled.get(candidate, {}) if part == FULL else {}
             rows[named] = checked_training(
                 named,
                 epochs,
-                "" if of_paper is None else str(of_paper),
+                content.epochs_of(named),
                 errors[candidate],
                 twice,
             )
@@ -257,9 +254,9 @@ def training_rows(
         rows[paper.FULL_SCALING] = replace(rows[paper.DEEP], candidate=paper.FULL_SCALING)
     not_trained = [] if is_complete else [name for name in content.candidates if name not in rows]
     for name in not_trained:
-        of_paper = content.candidates[name].epochs_paper
-        epochs_paper = "" if of_paper is None else str(of_paper)
-        rows[name] = TrainingRow(name, "", epochs_paper, "not trained", "no seed is trained yet")
+        rows[name] = TrainingRow(
+            name, "", content.epochs_of(name), "not trained", "no seed is trained yet"
+        )
     return list(rows.values())
 
 

@@ -47,13 +47,13 @@ from vehest_papers.cnn_ukf.subjects import (
     runs_of,
 )
 from vehest_papers.kit import methods
-from vehest_papers.kit.block_rows import BLOCKS, TRAINING, BlockRow, TrainingRow, frame
+from vehest_papers.kit.block_rows import BlockRow, TrainingRow
 from vehest_papers.kit.claim_files import Paper, claims_of
 from vehest_papers.kit.loss_curves import NAME as LOSS_CURVES
 from vehest_papers.kit.loss_curves import loss_curves, loss_figure
 from vehest_papers.kit.reading import words_of_kinds
 from vehest_papers.kit.verdict_table import (
-    CLAIMS,
+    claim_files,
     claims_table,
     figure_in_words,
     without_line_breaks,
@@ -152,11 +152,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     )
     claims = claims_table(content, outcome.rows, trained)
     outcome.blocks.append(_verdicts(claims))
-    outcome.data |= {
-        CLAIMS: claims.frame,
-        BLOCKS: frame(outcome.rows, BlockRow),
-        TRAINING: frame(trained, TrainingRow),
-    }
+    outcome.data |= claim_files(claims, outcome.rows, trained)
     values = _values(subjects, content, trained, sorted(outcome.data))
     blocks = fill_template(TEMPLATE, values, outcome.blocks)
     return {REPORT: Document(artefacts.title, blocks, outcome.data)}

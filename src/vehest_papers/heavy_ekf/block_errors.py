@@ -25,6 +25,7 @@ from vehest_papers.kit.block_rows import (
     BlockRow,
     TrainingRow,
     block_rows,
+    name_in_blocks,
     names_of_blocks,
 )
 
@@ -56,7 +57,7 @@ def drive_rows(name: str, part: PartArtefacts) -> list[BlockRow]:
         recordings = [spans[int(piece)].recording for piece in first.piece]
         names = names_of_blocks(labels, recordings, first.start)
         for title, model in models.items():
-            head = BlockRow(name, _named(title), model.seed, test, "rmse_sideslip")
+            head = BlockRow(name, name_in_blocks(title), model.seed, test, "rmse_sideslip")
             errors = segments[title]
             sums = block_sums(errors.squared_error_sideslip, labels)
             rows += block_rows(head, names, sums, block_sums(errors.sideslip_samples, labels))
@@ -76,7 +77,7 @@ def twin_rows(twin: Factorial) -> list[BlockRow]:
         sign = "minus_" if mismatch < 0 else ""
         test = f"slip_{slip:g}_stiffness_{sign}{100 * abs(mismatch):.0f}"
         for title in NAMES:
-            head = BlockRow("twin", _named(title), 0, test, "rmse_sideslip")
+            head = BlockRow("twin", name_in_blocks(title), 0, test, "rmse_sideslip")
             rows += block_rows(head, names, samples * cell.squared[title], samples)
     return rows
 
@@ -117,13 +118,13 @@ def measured_rows(
             continue
         changes = accuracy.log_change_of_last_lap(drives[LAPS], estimates[LAPS][title], min_speed)
         blocks = [f"segment {number} of {len(changes)}" for number in range(1, len(changes) + 1)]
-        head = BlockRow(name, _named(title), 0, LAPS, "ratte_better_on_faster_laps")
+        head = BlockRow(name, name_in_blocks(title), 0, LAPS, "ratte_better_on_faster_laps")
         rows += block_rows(head, blocks, changes, 1.0)
         errors = [
             accuracy.error_before_stop(drives[f"{tyres}_laps"], estimates[f"{tyres}_laps"][title])
             for tyres in TYRES
         ]
-        head = BlockRow(name, _named(title), 0, STOPS, "ratte_until_0_4_s_before_stop")
+        head = BlockRow(name, name_in_blocks(title), 0, STOPS, "ratte_until_0_4_s_before_stop")
         rows += block_rows(head, list(TYRES.values()), np.array(errors), 1.0)
     return rows
 
@@ -135,7 +136,7 @@ def training_rows() -> list[TrainingRow]:
         (*BASELINE_NAMES, MEASURED, CORRECTED), "nothing is trained in epochs"
     )
     return [
-        TrainingRow(_named(name), "", "", "not applicable", reason)
+        TrainingRow(name_in_blocks(name), "", "", "not applicable", reason)
         for name, reason in reasons.items()
     ]
 
@@ -145,7 +146,3 @@ def models_of(part: PartArtefacts) -> dict[str, EvaluatedModel]:
     titles = titles_of(part)
     models = {titles[model.name]: model for model in reversed(part.models)}
     return {title: models[title] for title in NAMES if title in models}
-
-
-def _named(title: str) -> str:
-    return BASELINE_NAMES.get(title, title)

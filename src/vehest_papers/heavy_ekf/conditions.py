@@ -28,6 +28,7 @@ from vehest_papers.kit.verdicts import (
     Figure,
     Judgement,
     judge_paper,
+    keys_of,
     paired_errors,
     value_of,
 )
@@ -186,7 +187,7 @@ def _judged(
     for condition in conditions:
         for identifier in ORDERS:
             claim = _in_condition(by_id[identifier], condition, f"order_{len(claims)}")
-            first, second = (Key(*key) for key in _keys(claim))
+            first, second = keys_of(claim)
             if first in blocks and second in blocks:
                 claims[claim.id] = (claim, condition)
     judgements = judge_paper(
@@ -212,10 +213,6 @@ def _in_condition(claim: Claim, condition: Condition, identifier: str) -> Claim:
     )
 
 
-def _keys(claim: Claim) -> list[tuple[str, str, str, str]]:
-    return [(claim.part, name, claim.test_set, claim.metric) for name in claim.names]
-
-
 def _entry(
     claim: Claim,
     condition: Condition,
@@ -223,7 +220,7 @@ def _entry(
     blocks: Mapping[Key, BlockErrors],
     n_claims: int,
 ) -> Entry:
-    first, second = (blocks[Key(*key)] for key in _keys(claim))
+    first, second = (blocks[key] for key in keys_of(claim))
     order = paired_errors(first, second, claim.metric, claim.id).order()
     assert claim.ratio is not None
     assert judgement.size is not None

@@ -23,7 +23,7 @@ from vehest_papers.heavy_ekf.candidates import (
     sideslip_of,
     tuned,
 )
-from vehest_papers.kit.block_rows import BASELINE_NAMES, BlockRow, block_rows
+from vehest_papers.kit.block_rows import BlockRow, block_rows, name_in_blocks
 
 START, STOP = 150.0, 700.0  # s, driven throughout
 N_FOLDS = 5
@@ -91,7 +91,6 @@ def _rows(name: str, drive: Recording, sideslip: dict[str, FloatArray]) -> list[
     for candidate, values in sideslip.items():
         errors = measured.squared_error(values)
         sums = np.bincount(labels, errors, n_blocks).astype(np.float64)
-        title = BASELINE_NAMES.get(candidate, candidate)
-        head = BlockRow(name, title, 0, TEST_SET, "rmse_sideslip")
+        head = BlockRow(name, name_in_blocks(candidate), 0, TEST_SET, "rmse_sideslip")
         rows += block_rows(head, blocks, sums, sizes)
     return rows

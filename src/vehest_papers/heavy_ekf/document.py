@@ -40,18 +40,11 @@ from vehest_papers.heavy_ekf.subjects import (
     titles_of,
 )
 from vehest_papers.kit import methods
-from vehest_papers.kit.block_rows import (
-    BASELINE_NAMES,
-    BLOCKS,
-    TRAINING,
-    BlockRow,
-    TrainingRow,
-    frame,
-)
+from vehest_papers.kit.block_rows import BASELINE_NAMES
 from vehest_papers.kit.claim_files import claims_of
 from vehest_papers.kit.reading import words_of_kinds
 from vehest_papers.kit.verdict_table import (
-    CLAIMS,
+    claim_files,
     claims_table,
     decided_claims,
     without_line_breaks,
@@ -103,7 +96,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     trained = block_errors.training_rows()
     slips = {test: rear_slip([drive]) for test, drive in drives.items()} | trucks.pooled_slips
     orders, tuning, by_condition = conditions.orders_tables(content, rows, trained)
-    kinds = dict(content.parts) | {name: words_of_kinds(part) for name, part in parts.items()}
+    kinds = {name: words_of_kinds(part) for name, part in parts.items()}
     claims = claims_table(content, rows, trained, kinds)
     placed: list[Block] = [
         orders,
@@ -116,15 +109,13 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     ]
     values = _values(artefacts, by_condition, trucks, without_line_breaks(content.recommendation))
     data = {
-        CLAIMS: claims.frame,
         "orders_by_condition": by_condition,
         "twin_map_cells": region_map.map_cells(twin),
         "twin_cells": every_cell(twin),
         "noise_levels": _noise_levels(trucks, twin),
         "rear_slip": _slips_by_truck(trucks),
         "ranges": methods.ranges(artefacts),
-        BLOCKS: frame(rows, BlockRow),
-        TRAINING: frame(trained, TrainingRow),
+        **claim_files(claims, rows, trained),
     }
     return {REPORT: Document(artefacts.title, fill_template(TEMPLATE, values, placed), data)}
 

@@ -32,7 +32,7 @@ from vehest_papers.heavy_ekf.candidates import (
 )
 from vehest_papers.heavy_ekf.subjects import TYRES, corners
 from vehest_papers.heavy_ekf.twin import TRUCK
-from vehest_papers.kit.block_rows import BASELINE_NAMES, BlockRow, block_rows
+from vehest_papers.kit.block_rows import BlockRow, block_rows, name_in_blocks
 
 ROADS = ("level", "crossfall")
 CONDITIONS = tuple(f"{tyres}_{road}" for road in ROADS for tyres in TYRES)
@@ -157,7 +157,7 @@ def _rows(
     masks["rmse_sideslip_turning"] = turning
     rows = []
     for name, of_laps in estimates.items():
-        head = BlockRow(part_name, BASELINE_NAMES.get(name, name), 0, condition, "")
+        head = BlockRow(part_name, name_in_blocks(name), 0, condition, "")
         for metric, of_metric in masks.items():
             sums = np.array(
                 [

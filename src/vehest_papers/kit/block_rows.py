@@ -55,6 +55,11 @@ class TrainingRow:
     seeds_planned: int = 0  # 0: all that are planned are trained
 
 
+def name_in_blocks(title: str) -> str:
+    """Name in blocks.csv of a candidate as the report calls it."""
+    return BASELINE_NAMES.get(title, title)
+
+
 def block_rows(
     row: BlockRow, blocks: Sequence[str], values: FloatArray, sizes: FloatArray | float
 ) -> list[BlockRow]:

@@ -117,6 +117,12 @@ class Paper:
     rests_on: Mapping[str, list[str]] = field(default_factory=dict)
     """Claim's id -> verdicts with which the recommendation stands; empty: it is shown only."""
 
+    def epochs_of(self, candidate: str) -> str:
+        """Epochs of the paper's training; empty where it trains or declares no such candidate."""
+        declared = self.candidates.get(candidate)
+        epochs = None if declared is None else declared.epochs_paper
+        return "" if epochs is None else str(epochs)
+
     def published(self, part: str, test_set: str, candidate: str, metric: str) -> float:
         """A figure of the paper's tables; NaN where it states none."""
         figures = {

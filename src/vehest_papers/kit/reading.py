@@ -15,7 +15,7 @@ from vehest.data.store import read_recording
 from vehest.evaluation.metrics import Scored
 from vehest.report.document import as_text
 from vehest.report.style import MISSING, fixed
-from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
+from vehest.studies.artefacts import EvaluatedModel, PartArtefacts, nominal_rows
 
 MAX_RANGES_NAMED = 12
 
@@ -104,9 +104,6 @@ def metric_values(part: PartArtefacts) -> dict[tuple[str, str, int, str, str], f
     dict
         (estimator, variant, seed, test set, metric) -> value.
     """
-    metrics = part.metrics[
-        (part.metrics["subset"] == "all") & (part.metrics["condition"] == "nominal")
-    ]
     return {
         (
             str(row["estimator"]),
@@ -115,7 +112,7 @@ def metric_values(part: PartArtefacts) -> dict[tuple[str, str, int, str, str], f
             str(row["test_set"]),
             str(row["metric"]),
         ): float(row["value"])
-        for row in metrics.to_dict("records")
+        for row in nominal_rows(part.metrics).to_dict("records")
     }
 
 

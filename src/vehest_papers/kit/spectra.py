@@ -58,11 +58,9 @@ def third_octave(frequency: FloatArray, hz: float) -> NDArray[np.bool_]:
     return inside
 
 
-def periodogram(
-    series: Sequence[FloatArray], rate_hz: float, segment_seconds: float = SEGMENT_SECONDS
-) -> Periodogram:
-    """Welch's method over several series: Hann windows that overlap by half, each segment without
-    its mean.
+def periodogram(series: Sequence[FloatArray], rate_hz: float) -> Periodogram:
+    """Welch's method over several series: Hann windows of `SEGMENT_SECONDS` that overlap by half,
+    each segment without its mean.
 
     Series count by their number of segments; what is left over at the end of each counts nowhere.
     The line at 0 Hz and, because the window spreads what slowly varies, the one beside it are not
@@ -74,15 +72,13 @@ def periodogram(
         Uniformly sampled, finite, each of shape (T,).
     rate_hz
         Sampling rate [Hz].
-    segment_seconds
-        Length of a segment [s].
 
     Raises
     ------
     DataError
         There is none, one is shorter than a segment, or one has gaps.
     """
-    length = round(segment_seconds * rate_hz)
+    length = round(SEGMENT_SECONDS * rate_hz)
     if not series:
         raise DataError("a periodogram needs at least one series")
     total = np.zeros(length // 2 + 1)
@@ -91,7 +87,7 @@ def periodogram(
         if len(samples) < length:
             raise DataError(
                 f"series {position} lasts {len(samples) / rate_hz:.1f} s, less than a segment of "
-                f"the periodogram ({segment_seconds:g} s); give longer ones or a shorter segment"
+                f"the periodogram ({SEGMENT_SECONDS:g} s); give longer ones or a shorter segment"
             )
         if not np.isfinite(samples).all():
             raise DataError(f"series {position} has gaps, which a periodogram cannot skip")

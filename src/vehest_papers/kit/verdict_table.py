@@ -6,14 +6,14 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import pandas as pd
 
 from vehest.report.document import Column, Table
 from vehest.report.style import MISSING, significant
 from vehest_papers.kit.block_errors import Training, blocks_of, training_of
-from vehest_papers.kit.block_rows import BlockRow, TrainingRow
+from vehest_papers.kit.block_rows import BLOCKS, TRAINING, BlockRow, TrainingRow, frame
 from vehest_papers.kit.claim_files import Claim, Paper
 from vehest_papers.kit.verdicts import VERDICTS, Figure, Judgement, judge_paper, least_training
 
@@ -58,13 +58,25 @@ def claims_table(
     rows = [_row(paper, claim, judgements[claim.id], trained, origins) for claim in paper.claims]
     counts = Counter(judgements[claim.id].verdict for claim in paper.claims if not claim.is_added)
     numbers = ", ".join(f"{counts[verdict]} {verdict}" for verdict in VERDICTS if counts[verdict])
-    frame = pd.DataFrame(rows)
     caption = (
         "The paper's claims, judged from the errors by block and seed of tables/blocks.csv: "
         f"{numbers}. What decided each is in the CSV; `docs/scorecard.md` says what the verdicts "
         "mean."
     )
-    return Table(CLAIMS, caption, frame, COLUMNS)
+    return Table(CLAIMS, caption, pd.DataFrame(rows), COLUMNS)
+
+
+def claim_files(
+    claims: Table, blocks: Sequence[BlockRow], training: Sequence[TrainingRow]
+) -> dict[str, pd.DataFrame]:
+    """Name -> table, of the files from which the scorecard judges a study: the claims of
+    `claims_table`, with the errors and trainings that decide them.
+    """
+    return {
+        CLAIMS: claims.frame,
+        BLOCKS: frame(blocks, BlockRow),
+        TRAINING: frame(training, TrainingRow),
+    }
 
 
 def decided_claims(claims: Table) -> Table:
@@ -72,13 +84,13 @@ def decided_claims(claims: Table) -> Table:
 
     The scorecard lists all of them.
     """
-    frame = claims.frame[claims.frame["verdict"].isin(DECIDED)]
+    decided = claims.frame[claims.frame["verdict"].isin(DECIDED)]
     columns = {name: COLUMNS[name] for name in ("claim", "published", "ours", "verdict")}
     caption = (
-        f"The {len(frame)} claims that this study decides, of {len(claims.frame)}; the "
+        f"The {len(decided)} claims that this study decides, of {len(claims.frame)}; the "
         f"[scorecard](../scorecard.md) has the others. {claims.caption}"
     )
-    return Table(DECIDED_CLAIMS, caption, frame[list(columns)], columns)
+    return Table(DECIDED_CLAIMS, caption, decided[list(columns)], columns)
 
 
 def _row(
@@ -137,12 +149,11 @@ def published_in_words(claim: Claim, named: Callable[[str], str] = str) -> str:
 
 def epochs_in_words(paper: Paper, candidate: str, training: Training | None) -> str:
     """Epochs of the least trained candidate, the paper's, and what is known of the training."""
-    declared = paper.candidates.get(candidate)
-    of_paper = declared.epochs_paper if declared is not None else None
+    of_paper = paper.epochs_of(candidate)
     if training is None or training.state == "not applicable":
-        return MISSING if of_paper is None else f"{MISSING} / {of_paper}"
+        return f"{MISSING} / {of_paper}" if of_paper else MISSING
     ours = training.epochs or MISSING
-    published = training.epochs_paper or (MISSING if of_paper is None else str(of_paper))
+    published = training.epochs_paper or of_paper or MISSING
     return f"{ours} / {published}, {training.state}"
 
 

@@ -65,6 +65,7 @@ ALPHA = 1.0 - CONFIDENCE
 EQUALITY_CONFIDENCE = 0.90  # two one-sided tests at 5 % (Schuirmann 1987)
 DEFAULT_MARGIN = 0.1
 TARGET_POWER = 0.8
+MET = ("reproduced", "direction only")  # verdicts on a claim that is met
 NOT_PUBLISHED = "per-block errors of this study are not published yet"
 
 
@@ -110,12 +111,17 @@ class Pair:
         """Blocks in which both are finite."""
         return len(self.sizes)
 
+    @property
+    def has_logarithms(self) -> NDArray[np.bool_]:
+        """Whether both errors of a block are above zero, (B,)."""
+        return np.asarray((self.first > 0).all(axis=0) & (self.second > 0).all(axis=0))
+
     def order(self) -> Contrast:
         """Mean over blocks and seeds of the logarithm of first / second.
 
         Blocks without any error of either have no logarithm and are left out.
         """
-        positive = (self.first > 0).all(axis=0) & (self.second > 0).all(axis=0)
+        positive = self.has_logarithms
         return _scaled(
             mean_contrast(
                 np.log(self.first[:, positive]),
@@ -135,8 +141,7 @@ class Pair:
     @property
     def is_testable(self) -> bool:
         """Whether there are blocks enough, with errors above zero, for an interval."""
-        positive = (self.first > 0).all(axis=0) & (self.second > 0).all(axis=0)
-        return int(positive.sum()) >= MIN_BLOCKS
+        return int(self.has_logarithms.sum()) >= MIN_BLOCKS
 
 
 @dataclass(frozen=True)
@@ -231,7 +236,7 @@ def value_of(errors: BlockErrors, metric: str) -> tuple[Contrast | None, Figure]
         error = value**exponent if value >= 0 else math.nan
         return None, Figure(error, math.nan, math.nan)
     contrast = _scaled(log_ratio_of_pooled(sums, sizes[None]), exponent)
-    return contrast, _exponential(contrast, CONFIDENCE)
+    return contrast, _exponential(contrast)
 
 
 def ratio_of(pair: Pair) -> Figure:
@@ -239,7 +244,7 @@ def ratio_of(pair: Pair) -> Figure:
     blocks.
     """
     if pair.is_testable:
-        return _exponential(pair.size(), CONFIDENCE)
+        return _exponential(pair.size())
     ratio = pair.first.mean(axis=0).sum() / pair.second.mean(axis=0).sum()
     return Figure(float(ratio) ** pair.exponent, math.nan, math.nan)
 
@@ -289,9 +294,7 @@ def judge_row(
     )
     if blocks is None:
         return Judgement("not assessed", NOT_PUBLISHED, {})
-    judgement = _with_divergence(_judge_pooled(claim, blocks, with_baselines=False))
-    judgement = _without_single_trainings(judgement, claim, training)
-    return _with_missing_trainings(judgement, claim, training)
+    return _with_remarks(_judge_pooled(claim, blocks, with_baselines=False), claim, training)
 
 
 def least_training(claim: Claim, training: Mapping[str, Training]) -> tuple[str, Training | None]:
@@ -325,13 +328,18 @@ def _orders_of(paper: Paper, blocks: Mapping[Key, BlockErrors]) -> dict[str, Ord
     return ordered
 
 
+def keys_of(claim: Claim) -> list[Key]:
+    """Keys of the errors of the candidates that a claim compares, the other in its own part."""
+    parts = (claim.part, claim.other_part or claim.part)
+    return [
+        Key(part, name, claim.test_set, claim.metric)
+        for part, name in zip(parts, claim.names, strict=False)
+    ]
+
+
 def _pair_of(claim: Claim, blocks: Mapping[Key, BlockErrors]) -> Pair | None:
     """Errors of a claim's two candidates; None where those of one are not published."""
-    assert claim.candidate is not None
-    assert claim.other is not None
-    first = blocks.get(Key(claim.part, claim.candidate, claim.test_set, claim.metric))
-    part = claim.other_part or claim.part
-    second = blocks.get(Key(part, claim.other, claim.test_set, claim.metric))
+    first, second = (blocks.get(key) for key in keys_of(claim))
     if first is None or second is None:
         return None
     pair = paired_errors(first, second, claim.metric, f"claim {claim.id!r}")
@@ -354,8 +362,14 @@ def _judge(
         judgement = _judge_order(claim, blocks, ordered)
     else:
         judgement = _judge_pooled(claim, blocks)
-    judgement = _with_divergence(judgement)
-    judgement = _without_single_trainings(judgement, claim, training)
+    return _with_remarks(judgement, claim, training)
+
+
+def _with_remarks(
+    judgement: Judgement, claim: Claim, training: Mapping[str, Training]
+) -> Judgement:
+    """A judgement with what its errors and trainings lack, which may withdraw its verdict."""
+    judgement = _without_single_trainings(_with_divergence(judgement), claim, training)
     return _with_missing_trainings(judgement, claim, training)
 
 
@@ -406,7 +420,7 @@ def _without_single_trainings(
     if not names:
         return judgement
     verdict = judgement.verdict
-    if verdict in ("reproduced", "direction only", "contradicted", "met by a trivial baseline"):
+    if verdict in (*MET, "contradicted", "met by a trivial baseline"):
         verdict = "no significant difference" if claim.kind == "order" else "inconclusive"
     verb = "has" if len(names) == 1 else "have"
     words = f"{' and '.join(names)} {verb} one seed; at least two are needed"
@@ -414,12 +428,7 @@ def _without_single_trainings(
 
 
 def _not_assessed(claim: Claim, blocks: Mapping[Key, BlockErrors]) -> Judgement:
-    parts = [claim.part, claim.other_part or claim.part]
-    missing = [
-        name
-        for name, part in zip(claim.names, parts, strict=False)
-        if Key(part, name, claim.test_set, claim.metric) not in blocks
-    ]
+    missing = [key.candidate for key in keys_of(claim) if key not in blocks]
     reason = f"no per-block errors of {' and '.join(missing)} in this metric are published"
     return Judgement("not assessed", reason, {})
 
@@ -434,16 +443,18 @@ def _judge_order(
     if ordered is None:
         reason = f"{number_of(pair.n_blocks, 'block')} with finite errors above zero: no test"
         return replace(judgement, verdict="no significant difference", reason=reason)
+    verdict, reason = _verdict_of_order(claim, pair, ordered, blocks)
     judgement = replace(
         judgement,
-        order=_exponential(ordered.order, CONFIDENCE),
-        size=_exponential(ordered.size, CONFIDENCE),
+        verdict=verdict,
+        reason=reason,
+        order=_exponential(ordered.order),
+        size=_exponential(ordered.size),
         p_value=ordered.p_value,
     )
-    verdict, reason = _verdict_of_order(claim, pair, ordered, blocks)
     if verdict == "no significant difference":
-        return _with_power(replace(judgement, verdict=verdict, reason=reason), claim, ordered)
-    return replace(judgement, verdict=verdict, reason=reason)
+        return _with_power(judgement, claim, ordered)
+    return judgement
 
 
 def _verdict_of_order(
@@ -491,16 +502,15 @@ def _baseline_in_place(claim: Claim, level: float, blocks: Mapping[Key, BlockErr
     A claim that the candidate's error is higher is on a weakness of it, which a baseline with a
     lower error confirms.
     """
-    assert claim.other is not None
     if claim.direction == "higher":
         return ""
-    other_part = claim.other_part or claim.part
-    against = blocks[Key(other_part, claim.other, claim.test_set, claim.metric)]
+    key, key_of_other = keys_of(claim)
     for name in BASELINES:
-        errors = blocks.get(Key(claim.part, name, claim.test_set, claim.metric))
-        if name in (claim.candidate, claim.other) or errors is None:
+        errors = blocks.get(key._replace(candidate=name))
+        if name in claim.names or errors is None:
             continue
-        pair = paired_errors(errors, against, claim.metric, f"claim {claim.id!r}, baseline {name}")
+        subject = f"claim {claim.id!r}, baseline {name}"
+        pair = paired_errors(errors, blocks[key_of_other], claim.metric, subject)
         if pair.n_diverged[0] == 0 and pair.is_testable:
             statistics = Ordered(pair.order(), pair.size(), math.nan, level)
             if statistics.is_significant(is_lower=True):
@@ -518,14 +528,11 @@ def _with_power(judgement: Judgement, claim: Claim, ordered: Ordered) -> Judgeme
     effect = math.log(ratio)
     power = ordered.order.power(effect, ordered.level)
     reason = f"{judgement.reason}; power {100 * power:.0f} % to detect the paper's {ratio:.3g}"
+    judgement = replace(judgement, power=power, reason=reason)
     if power >= TARGET_POWER:
-        return replace(judgement, power=power, reason=reason)
-    blocks_needed = ordered.order.blocks_needed(effect, TARGET_POWER, ordered.level)
-    return replace(
-        judgement,
-        power=power,
-        blocks_needed=blocks_needed,
-        reason=f"{reason}; {_blocks_needed_text(blocks_needed)}",
+        return judgement
+    return _with_blocks_needed(
+        judgement, ordered.order.blocks_needed(effect, TARGET_POWER, ordered.level)
     )
 
 
@@ -540,11 +547,11 @@ def _judge_pooled(
             return _not_assessed(claim, blocks)
         judgement = _described(claim, pair, blocks)
         contrast = pair.size() if pair.is_testable else None
-        size = _exponential(contrast, CONFIDENCE) if contrast else None
-        order = _exponential(pair.order(), CONFIDENCE) if contrast else None
+        size = _exponential(contrast) if contrast else None
+        order = _exponential(pair.order()) if contrast else None
         judgement = replace(judgement, size=size, order=order)
     else:
-        errors = blocks.get(Key(claim.part, claim.candidate, claim.test_set, claim.metric))
+        errors = blocks.get(keys_of(claim)[0])
         if errors is None:
             return _not_assessed(claim, blocks)
         contrast, figure = value_of(errors, claim.metric)
@@ -555,7 +562,7 @@ def _judge_pooled(
         )
         return replace(judgement, verdict="inconclusive", reason=reason)
     verdict, reason = _verdict_of_range(claim, contrast)
-    if verdict in ("reproduced", "direction only") and with_baselines:
+    if verdict in MET and with_baselines:
         for name in BASELINES:
             if name not in claim.names and _is_met_by(name, claim, blocks):
                 reason = f"{name} in its place would meet the claim too"
@@ -587,28 +594,29 @@ def _log_range(claim: Claim) -> tuple[float, float]:
     """Logarithms of the ends of the claimed range."""
     if claim.direction is not None:
         assert claim.limit is not None
-        edge = math.log(claim.limit)
-        return (-math.inf, edge) if claim.direction == "lower" else (edge, math.inf)
+        return _one_sided(claim, math.log(claim.limit))
     margin = claim.margin if claim.margin is not None else DEFAULT_MARGIN
     middle = math.log(claim.limit) if claim.limit is not None else 0.0
     return middle + math.log1p(-margin), middle + math.log1p(margin)
 
 
+def _one_sided(claim: Claim, edge: float) -> tuple[float, float]:
+    """Ends of the range on the claimed side of an edge."""
+    return (-math.inf, edge) if claim.direction == "lower" else (edge, math.inf)
+
+
 def _is_met_by(name: str, claim: Claim, blocks: Mapping[Key, BlockErrors]) -> bool:
     """Whether a baseline in the candidate's place meets a limit or an equality."""
-    errors = blocks.get(Key(claim.part, name, claim.test_set, claim.metric))
+    swapped = replace(claim, candidate=name)
+    errors = blocks.get(keys_of(swapped)[0])
     if errors is None or not np.isfinite(errors.sums).all():
         return False
-    swapped = replace(claim, candidate=name)
     if claim.other is not None:
         pair = _pair_of(swapped, blocks)
         contrast = pair.size() if pair is not None and pair.is_testable else None
     else:
         contrast, _ = value_of(errors, claim.metric)
-    return contrast is not None and _verdict_of_range(swapped, contrast)[0] in (
-        "reproduced",
-        "direction only",
-    )
+    return contrast is not None and _verdict_of_range(swapped, contrast)[0] in MET
 
 
 def _with_needed_blocks(judgement: Judgement, claim: Claim, contrast: Contrast) -> Judgement:
@@ -621,11 +629,7 @@ def _with_needed_blocks(judgement: Judgement, claim: Claim, contrast: Contrast) 
     distance = min(abs(contrast.value - edge) for edge in (low, high) if math.isfinite(edge))
     level = ALPHA if claim.direction is not None else 1.0 - EQUALITY_CONFIDENCE
     blocks_needed = contrast.blocks_needed(distance, TARGET_POWER, level) if distance > 0 else None
-    return replace(
-        judgement,
-        blocks_needed=blocks_needed,
-        reason=f"{judgement.reason}; {_blocks_needed_text(blocks_needed)}",
-    )
+    return _with_blocks_needed(judgement, blocks_needed)
 
 
 @dataclass(frozen=True)
@@ -662,7 +666,7 @@ def _measure(claim: Claim, errors: BlockErrors) -> Measured:
     contrast = mean_contrast(np.log(units) if is_ratio else units)
     figure = Figure(contrast.value, *contrast.interval())
     if is_ratio:
-        figure = _exponential(contrast, CONFIDENCE)
+        figure = _exponential(contrast)
     return Measured(contrast, is_ratio, figure, n_blocks, n_seeds, n_diverged)
 
 
@@ -692,13 +696,13 @@ def _judge_measured(claim: Claim, blocks: Mapping[Key, BlockErrors]) -> Judgemen
     if measured.contrast is None:
         return judgement
     verdict, reason = _verdict_of_measured(claim, measured.contrast, measured.is_ratio)
-    if verdict in ("reproduced", "direction only"):
+    if verdict in MET:
         for baseline in BASELINES:
             trivial = _measure(claim, rows[baseline]) if baseline in rows else None
             if trivial is None or trivial.contrast is None or baseline == claim.candidate:
                 continue
             met, _ = _verdict_of_measured(claim, trivial.contrast, trivial.is_ratio)
-            if met in ("reproduced", "direction only"):
+            if met in MET:
                 verdict = "met by a trivial baseline"
                 reason = f"{baseline} in its place would meet the claim too"
                 break
@@ -711,13 +715,11 @@ def _verdict_of_measured(claim: Claim, contrast: Contrast, is_ratio: bool) -> tu
     assert claim.limit is not None
     is_equality = claim.direction is None
     low, high = contrast.interval(EQUALITY_CONFIDENCE if is_equality else CONFIDENCE)
+    begin, end = _one_sided(claim, claim.limit)
     if is_equality:
         half = abs(claim.limit) * (claim.margin or DEFAULT_MARGIN)
         begin = claim.limit - half
         end = claim.limit + half
-    else:
-        begin = -math.inf if claim.direction == "lower" else claim.limit
-        end = claim.limit if claim.direction == "lower" else math.inf
     if contrast.error == 0 and contrast.value == claim.limit and not is_equality:
         return "contradicted", "exactly the limit in every block"
     if begin <= low and high <= end:
@@ -734,20 +736,17 @@ def _verdict_of_measured(claim: Claim, contrast: Contrast, is_ratio: bool) -> tu
 
 def _described(claim: Claim, pair: Pair, blocks: Mapping[Key, BlockErrors]) -> Judgement:
     """Values, counts and divergence of a claim on two candidates, without a verdict yet."""
-    parts = [claim.part, claim.other_part or claim.part]
+    keys = keys_of(claim)
     labels = list(claim.names)
     if labels[0] == labels[1]:
-        labels = [f"{name} ({part})" for name, part in zip(labels, parts, strict=True)]
-    sides = [
-        blocks[Key(part, name, claim.test_set, claim.metric)]
-        for name, part in zip(claim.names, parts, strict=True)
-    ]
+        labels = [f"{key.candidate} ({key.part})" for key in keys]
+    sides = {label: blocks[key] for label, key in zip(labels, keys, strict=True)}
     return Judgement(
         "inconclusive",
         "",
-        {label: value_of(side, claim.metric)[1] for label, side in zip(labels, sides, strict=True)},
+        {label: value_of(side, claim.metric)[1] for label, side in sides.items()},
         n_blocks=pair.n_blocks,
-        n_seeds={label: len(side.seeds) for label, side in zip(labels, sides, strict=True)},
+        n_seeds={label: len(side.seeds) for label, side in sides.items()},
         diverged=dict(zip(labels, pair.n_diverged, strict=True)),
     )
 
@@ -774,15 +773,20 @@ def _scaled(contrast: Contrast, factor: float) -> Contrast:
     return Contrast(factor * contrast.value, parts, contrast.n_blocks)
 
 
-def _exponential(contrast: Contrast, confidence: float) -> Figure:
-    low, high = contrast.interval(confidence)
+def _exponential(contrast: Contrast) -> Figure:
+    """A logarithm with its 95 % interval as a ratio or an error."""
+    low, high = contrast.interval()
     return Figure(math.exp(contrast.value), math.exp(low), math.exp(high))
 
 
-def _blocks_needed_text(number: int | None) -> str:
-    if number is None:
-        return "no number of blocks reaches 80 %: more seeds are needed"
-    return f"{number_of(number, 'block')} needed for 80 %"
+def _with_blocks_needed(judgement: Judgement, number: int | None) -> Judgement:
+    """A judgement with the number of blocks that 80 % would need; None where none is enough."""
+    needed = (
+        "no number of blocks reaches 80 %: more seeds are needed"
+        if number is None
+        else f"{number_of(number, 'block')} needed for 80 %"
+    )
+    return replace(judgement, blocks_needed=number, reason=f"{judgement.reason}; {needed}")
 
 
 def _short_p(p_value: float) -> str:

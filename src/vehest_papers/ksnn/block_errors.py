@@ -24,6 +24,7 @@ from vehest_papers.kit.block_rows import (
     checked_training,
 )
 from vehest_papers.kit.claim_files import BASELINES, Paper
+from vehest_papers.kit.verdicts import keys_of
 from vehest_papers.ksnn import measures
 from vehest_papers.ksnn.behaviour import Behaviour
 from vehest_papers.ksnn.candidates import category_of, runs_of
@@ -75,9 +76,8 @@ def compared_candidates(claimed: Paper) -> dict[Comparison, list[str]]:
     compared: dict[Comparison, list[str]] = {}
     for claim in claimed.claims:
         if claim.kind in ("order", "equal", "limit"):
-            parts = [claim.part, claim.other_part or claim.part]
-            for part, candidate in zip(parts, claim.names, strict=False):
-                compared.setdefault((part, claim.test_set, claim.metric), []).append(candidate)
+            for key in keys_of(claim):
+                compared.setdefault((key.part, key.test_set, key.metric), []).append(key.candidate)
     for table in claimed.tables:
         for row in table.rows:
             compared.setdefault((table.part, table.test_set, row.metric), []).append(row.candidate)
@@ -128,7 +128,7 @@ def _joined(errors: Sequence[BlockErrors]) -> BlockErrors:
 def _rows(part: str, candidate: str, test: str, metric: str, errors: BlockErrors) -> list[BlockRow]:
     rows = []
     for seed, sums in zip(errors.seeds, errors.sums, strict=True):
-        head = BlockRow(part, candidate, int(seed), test, metric, "", 0.0, 0)
+        head = BlockRow(part, candidate, int(seed), test, metric)
         rows += block_rows(head, errors.blocks, sums, errors.sizes)
     return rows
 
@@ -145,9 +145,7 @@ def measured_rows(claimed: Paper, parts: Mapping[str, Scheme]) -> list[BlockRow]
         if measured is None:
             continue
         for seed, values in enumerate(measured.values):
-            head = BlockRow(
-                claim.part, claim.candidate or "-", seed, claim.test_set, claim.id, "", 0.0, 0
-            )
+            head = BlockRow(claim.part, claim.candidate or "-", seed, claim.test_set, claim.id)
             rows += block_rows(head, measured.blocks, values, 1.0)
     return rows
 
@@ -166,7 +164,7 @@ def training_rows(
     """
     validation, doubled = _validation_errors(parts)
     rows = []
-    for candidate, declared in claimed.candidates.items():
+    for candidate in claimed.candidates:
         trained_as = candidate.removesuffix(CORRECTED)
         models = [
             model
@@ -198,12 +196,11 @@ def training_rows(
         if any(len(epochs_of_seeds) for epochs_of_seeds in stops):
             epochs = np.concatenate(stops)
             words += f", {epochs.min():.0f} to {epochs.max():.0f} by early stopping"
-        of_paper = "" if declared.epochs_paper is None else str(declared.epochs_paper)
         rows.append(
             checked_training(
                 candidate,
                 words,
-                of_paper,
+                claimed.epochs_of(candidate),
                 validation.get(category, {}),
                 doubled.get(category, {}),
             )

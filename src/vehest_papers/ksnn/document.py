@@ -17,13 +17,12 @@ from vehest.report.document import PATENT_NOTE, REPORT, Block, Column, Document,
 from vehest.report.style import MISSING, fixed
 from vehest.report.template import fill_template
 from vehest.studies.artefacts import StudyArtefacts
-from vehest_papers.kit.block_rows import BLOCKS, TRAINING, BlockRow, TrainingRow, frame
 from vehest_papers.kit.claim_files import claims_of
 from vehest_papers.kit.methods import absent_parts
 from vehest_papers.kit.reading import recordings_of, words_of_kinds
 from vehest_papers.kit.verdict_table import (
-    CLAIMS,
     DECIDED,
+    claim_files,
     claims_table,
     figure_in_words,
     without_line_breaks,
@@ -131,9 +130,9 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     }
     data = {"pairs_ratios": ratios_table(errors)} if len(errors) else {}
     data |= {"windows": windows} if len(windows) else {}
-    data |= {CLAIMS: claims.frame, "sub_models": shares, "pair_errors": errors}
+    data |= {"sub_models": shares, "pair_errors": errors}
     data |= {f"candidates_{name}": schemes[name].runs for name in SCHEMES if name in schemes}
-    data |= {BLOCKS: frame(rows, BlockRow), TRAINING: frame(trained, TrainingRow)}
+    data |= claim_files(claims, rows, trained)
     blocks = [*fill_template(TEMPLATE, values, tables), PATENT_NOTE]
     return {REPORT: Document(artefacts.title, blocks, data)}
 

@@ -199,14 +199,15 @@ def errors_table(errors: pd.DataFrame, measure: str) -> Table:
 WORDS = {"stop": "at the stop", "converged": "at convergence"}
 
 
-def ratios_table(errors: pd.DataFrame, candidate: str = paper.NONLINEAR) -> pd.DataFrame:
-    """FVU of one candidate over that of each other, and the smallest detectable ratio.
+def ratios_table(errors: pd.DataFrame) -> pd.DataFrame:
+    """FVU of the non-linear KS-NN over that of each other candidate, and the smallest detectable
+    ratio.
 
     Returns
     -------
     DataFrame
         ``over``: the other candidate. ``TEST_TRAINING_MEASURE``: geometric mean of the ratio with
-        its interval over pairs; below 1 the candidate is better. ``detectable``: smallest ratio
+        its interval over pairs; below 1 the KS-NN is better. ``detectable``: smallest ratio
         above 1 that so many pairs detect at a power of 80 % on the other car at the stop.
     """
     cells = [
@@ -217,6 +218,7 @@ def ratios_table(errors: pd.DataFrame, candidate: str = paper.NONLINEAR) -> pd.D
         ("third", "stop", "raw"),
     ]
     logs = {cell: log_fvu(errors, cell[1], cell[0], cell[2]) for cell in cells}
+    candidate = paper.NONLINEAR
     rows = []
     for name in TABLE_CANDIDATES:
         if name == candidate or any(

@@ -22,11 +22,11 @@ from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 from vehest.training.through_filter import Drive
 from vehest_papers.kit.block_errors import blocks_of
 from vehest_papers.kit.block_rows import (
-    BASELINE_NAMES,
     BlockRow,
     TrainingRow,
     block_rows,
     checked_training,
+    name_in_blocks,
     seed_rows,
 )
 from vehest_papers.kit.reading import metric_values, sideslip_error
@@ -70,7 +70,7 @@ def candidate_name(part: str, candidate: str) -> str:
         return f"{candidate}, {part.replace('_', ' ')}"
     length = LENGTH.fullmatch(part)
     if length is None:
-        return BASELINE_NAMES.get(candidate, candidate)
+        return name_in_blocks(candidate)
     steps, by_samples = length.groups()
     if int(steps) == MAX_STEPS:
         return f"{candidate}, {steps} steps"
@@ -161,9 +161,9 @@ def prediction_rows(
             for candidate, squares in zip((BEFORE, AFTER), of_test.one_step[:, place], strict=True):
                 for k, state in enumerate(MOVING):
                     metric = f"one_step_rmse_{WHEEL_SPEED.get(state, state)}"
-                    head = BlockRow(name, candidate, seed, test, metric, "", 0.0, 0)
+                    head = BlockRow(name, candidate, seed, test, metric)
                     rows += block_rows(head, names, (samples - 1) * squares[:, k], samples - 1)
-            head = BlockRow(name, SWAPPED, seed, test, "mse_weighted", "", 0.0, 0)
+            head = BlockRow(name, SWAPPED, seed, test, "mse_weighted")
             scored = samples - skip
             rows += block_rows(head, names, scored * of_test.swaps[1, 0][place], scored)
     return rows
@@ -186,7 +186,7 @@ def measured_rows(
     names = sequence_names(part, test)
     rows = []
     for (claim, candidate), values in measured.items():
-        head = BlockRow(name, candidate, 0, test, claim, "", 0.0, 0)
+        head = BlockRow(name, candidate, 0, test, claim)
         rows += seed_rows(head, seeds, names, values)
     return rows
 
@@ -277,7 +277,7 @@ def training_rows(
                 named, "", paper.epochs(named), "not trained", "no seed is trained yet", number
             )
     for baseline in paper.BASELINES:
-        named = BASELINE_NAMES.get(baseline, baseline)
+        named = name_in_blocks(baseline)
         rows[named] = TrainingRow(named, "", "", "not applicable", "nothing is learnt in epochs")
     return list(rows.values())
 

@@ -19,11 +19,8 @@ from vehest.studies.artefacts import EvaluatedModel, PartArtefacts, StudyArtefac
 from vehest_papers.kit.block_errors import BlockErrors, Key, blocks_of
 from vehest_papers.kit.block_rows import (
     BASELINE_NAMES,
-    BLOCKS,
-    TRAINING,
     BlockRow,
     TrainingRow,
-    frame,
 )
 from vehest_papers.kit.claim_files import Paper, claims_of
 from vehest_papers.kit.loss_curves import NAME as LOSS_CURVES
@@ -31,7 +28,7 @@ from vehest_papers.kit.loss_curves import loss_curves, loss_figure
 from vehest_papers.kit.methods import absent_parts
 from vehest_papers.kit.reading import words_of_kinds
 from vehest_papers.kit.verdict_table import (
-    CLAIMS,
+    claim_files,
     claims_table,
     decided_claims,
     figure_in_words,
@@ -123,8 +120,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
         *outcome.appendix,
         *provenance(artefacts, {MAIN: part}, data),
     ]
-    data |= {CLAIMS: claims.frame}
-    data |= {BLOCKS: frame(rows, BlockRow), TRAINING: frame(trained, TrainingRow)}
+    data |= claim_files(claims, rows, trained)
     return {REPORT: Document(artefacts.title, blocks, data)}
 
 

@@ -52,13 +52,13 @@ class Tracks:
         friction: FloatArray = self.mean[..., -round(LAST_SECONDS * self.rate_hz) :].mean(axis=-1)
         return friction
 
-    def covered(self, nominal: float, skip_seconds: float, deviations: float = 1.0) -> FloatArray:
+    def covered(self, nominal: float, skip_seconds: float) -> FloatArray:
         """Share of the samples after ``skip_seconds`` whose distance from a friction is within the
-        filter's deviations, (S, B).
+        filter's deviation, (S, B).
         """
         first = round(skip_seconds * self.rate_hz)
         distance = np.abs(self.mean[..., first:] - nominal)
-        is_within = distance <= deviations * self.deviation[..., first:]
+        is_within = distance <= self.deviation[..., first:]
         return np.asarray(is_within.mean(axis=-1))
 
 

@@ -114,8 +114,6 @@ def _csv_rows(study: Study) -> list[dict[str, str]]:
 
 def _csv_row(study: Study, claim: Claim, judgement: Judgement) -> dict[str, str]:
     name, state = least_training(claim, study.training)
-    declared = study.paper.candidates.get(name)
-    of_paper = "" if declared is None or declared.epochs_paper is None else declared.epochs_paper
     return {
         "paper": study.paper.paper,
         "row": "added comparison" if claim.is_added else "claim",
@@ -141,7 +139,7 @@ def _csv_row(study: Study, claim: Claim, judgement: Judgement) -> dict[str, str]
         "blocks_needed": str(judgement.blocks_needed or ""),
         "training": state.state if state is not None else "not applicable",
         "epochs": state.epochs if state is not None else "",
-        "epochs_paper": str(of_paper),
+        "epochs_paper": study.paper.epochs_of(name),
         "verdict": judgement.verdict,
         "reason": judgement.reason,
     }

@@ -15,15 +15,15 @@ from vehest_papers.scorecard.judged import PAPERS, read_study
 from vehest_papers.scorecard.paper_pages import paper_page
 
 
-def scorecard_files(results: Path, claims_folder: Path = CLAIMS_FOLDER) -> dict[str, str]:
+def scorecard_files(results: Path) -> dict[str, str]:
     """File below ``results`` -> its content: the pages and CSV files of the scorecard."""
-    studies = [read_study(name, results, claims_folder) for name in PAPERS]
+    studies = [read_study(name, results) for name in PAPERS]
     return {
         "scorecard.md": front_page(studies, results),
         **{study.page: paper_page(study, results) for study in studies},
         "scorecard.csv": rows_of_all(studies),
         "scorecard/changed_verdicts.csv": changed_verdicts(
-            studies, claims_folder / "claims_before.csv"
+            studies, CLAIMS_FOLDER / "claims_before.csv"
         ),
     }
 

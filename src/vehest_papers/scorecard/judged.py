@@ -8,14 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vehest_papers.kit.block_errors import (
-    BlockErrors,
-    Key,
     Training,
     read_blocks,
     read_training,
 )
 from vehest_papers.kit.block_rows import TrainingState
-from vehest_papers.kit.claim_files import CLAIMS_FOLDER, Claim, Paper, Row, Table, read_paper
+from vehest_papers.kit.claim_files import Claim, Paper, Row, Table, claims_of
 from vehest_papers.kit.verdicts import Judgement, judge_paper, judge_row, least_training
 
 PAPERS = ("ksnn", "learned_ukf", "heavy_ekf", "cnn_ukf")
@@ -93,16 +91,14 @@ class Study:
         }
 
 
-def read_study(name: str, results: Path, claims_folder: Path = CLAIMS_FOLDER) -> Study:
+def read_study(name: str, results: Path) -> Study:
     """Read a paper's claims and the errors by block of its study, and judge them."""
-    paper = read_paper(claims_folder / name / "claims.yaml")
+    paper = claims_of(name)
     tables = results / paper.study / "tables"
-    blocks: dict[Key, BlockErrors] | None = None
-    if (tables / "blocks.csv").exists():
-        blocks = read_blocks(tables / "blocks.csv")
-    training: dict[str, Training] = {}
-    if (tables / "training.csv").exists():
-        training = read_training(tables / "training.csv")
+    blocks_file = tables / "blocks.csv"
+    training_file = tables / "training.csv"
+    blocks = read_blocks(blocks_file) if blocks_file.exists() else None
+    training = read_training(training_file) if training_file.exists() else {}
     rows = [
         (table, row, judge_row(row, table, blocks, training))
         for table in paper.tables

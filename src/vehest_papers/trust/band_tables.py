@@ -12,7 +12,7 @@ from vehest.estimators.registry import estimator_class
 from vehest.report.document import Column, Figure, Table, as_text
 from vehest.report.figures import Reliability, reliability_figure
 from vehest.report.style import fixed, lines_of
-from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
+from vehest.studies.artefacts import EvaluatedModel, PartArtefacts, nominal_rows
 from vehest.studies.kit.drives import COVERAGES
 from vehest.studies.kit.runs import by_name
 from vehest.trust.bands import LEVELS, OTHER_VEHICLE
@@ -63,9 +63,7 @@ def coverage_board(parts: Mapping[str, PartArtefacts]) -> pd.DataFrame:
     """
     rows = []
     for key, part in parts.items():
-        metrics = part.metrics
-        metrics = metrics[(metrics["subset"] == "all") & (metrics["condition"] == "nominal")]
-        metrics = metrics.assign(variant=metrics["variant"].fillna(""))
+        metrics = nominal_rows(part.metrics).fillna({"variant": ""})
         for (estimator, variant), models in by_name(part.models).items():
             of_estimator = metrics[
                 (metrics["estimator"] == estimator) & (metrics["variant"] == variant)
