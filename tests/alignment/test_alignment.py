@@ -493,9 +493,7 @@ def test_steering_intervals_contain_the_truth():
             [1.0, -0.998],
             generator.standard_normal(len(road) + 5000),
         )[5000:]  # 5 s
-        recording = replace(
-            road, channels={**road.channels, "handwheel": road["handwheel"] + wander}
-        )
+        recording = road.with_channels({"handwheel": road["handwheel"] + wander})
         ratio = align(recording, AlignmentSettings(("steering_ratio",), wheelbase=WHEELBASE))[
             "steering_ratio"
         ]

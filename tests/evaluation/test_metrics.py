@@ -3,7 +3,6 @@ errors are known.
 """
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -153,7 +152,7 @@ def stopping(drive):
     vy = drive["vy_ref"].copy()
     vx[500:510] = 0.0003
     vy[500:510] = 0.0
-    return replace(drive, channels={**drive.channels, "vx": vx, "vy_ref": vy})
+    return drive.with_channels({"vx": vx, "vy_ref": vy})
 
 
 def test_sideslip_at_standstill_is_left_out_of_the_mean_and_lateral_velocity_is_not(drive):
@@ -178,7 +177,7 @@ def test_sideslip_at_standstill_is_left_out_of_the_mean_and_lateral_velocity_is_
 
 def test_standing_car_has_an_error_of_lateral_velocity_alone(drive):
     at_rest = {"vx": np.zeros(len(drive)), "vy_ref": np.zeros(len(drive))}
-    recording = replace(drive, channels={**drive.channels, **at_rest})
+    recording = drive.with_channels(at_rest)
     estimate = _estimate(recording.time, np.full(len(recording), 0.1), 20.0, 0.0)
     part = score(estimate, recording, Span("d", "drive"), Protocol())
     figures = accuracy([part])
@@ -304,7 +303,7 @@ def test_lever_arms_end_at_half_a_metre_and_need_a_turn():
     assert values["lever_arm"] == -MAX_LEVER_ARM
     yaw_rate = recording["yaw_rate"][-round((N / RATE - 1.5) * RATE) :]
     assert values["rmse_vy"] == pytest.approx(0.8 * np.sqrt(np.mean(yaw_rate**2)), rel=1e-9)
-    straight = replace(recording, channels={**recording.channels, "yaw_rate": np.zeros(N)})
+    straight = recording.with_channels({"yaw_rate": np.zeros(N)})
     values = figures(straight, recording["vy_ref"] + 0.1)
     assert (values["lever_arm"], values["rmse_vy"]) == (0.0, pytest.approx(0.1))
 

@@ -35,7 +35,7 @@ def scheme(folder, *, bias=False):
     }
     for seed, name in ((5, "f1"), (6, "f2")):
         drive = planar_drive(SECONDS, seed=seed, name=name)
-        drives[name] = replace(drive, channels={**drive.channels, "ay": drive["ay"] - OFFSET})
+        drives[name] = drive.with_channels({"ay": drive["ay"] - OFFSET})
     network = ksnn_with_weights(n_local=2, bias=bias)
     zero = estimator_class("zero").from_config({"rate_hz": 20.0})
     spans = {name: (Span("cars", name),) for name in drives}

@@ -57,7 +57,7 @@ def _drive(name="f1_001", seed=0, seconds=60.0, rate_hz=20.0, *, steered=0.0):
 
 def _with(recording, **channels):
     """The recording with some channels replaced."""
-    return replace(recording, channels={**recording.channels, **channels})
+    return recording.with_channels(channels)
 
 
 def _tally(*drives):
