@@ -36,22 +36,21 @@ RATE = 20.0
 PROTOCOL = Protocol(RATE, 2.0, 1.5)
 
 
-def noisy_reference(sigma, seconds=400.0, ay_noise=0.0, seed=3):
-    """A drive that obeys planar kinematics, white noise on its reference and its accelerometer."""
-    drive = planar_drive(seconds)
-    generator = np.random.default_rng(seed)
+def noisy_reference(sigma):
+    """A drive that obeys planar kinematics, white noise on its reference."""
+    drive = planar_drive(400.0)
+    generator = np.random.default_rng(3)
     channels = dict(drive.channels)
     channels["vy_ref"] = channels["vy_ref"] + sigma * generator.standard_normal(len(drive))
-    channels["ay"] = channels["ay"] + ay_noise * generator.standard_normal(len(drive))
     return Recording("drive", "car", RATE, 0.0, channels, "simulated")
 
 
-def single_track_drive(seconds=300.0, seed=0):
+def single_track_drive(seconds=300.0):
     """A car on its axles: v from yaw rate and the rear axle's slip, with slow errors.
 
     Ax, ay with offset and noise; steering.
     """
-    generator = np.random.default_rng(seed)
+    generator = np.random.default_rng(0)
     n = round(seconds * RATE)
     time = np.arange(n) / RATE
     u = 25.0 + 5.0 * np.sin(0.11 * time)
