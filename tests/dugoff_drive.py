@@ -33,7 +33,7 @@ def driven(inputs):
     return (*states[:, 0].T, *called(track, 1, states, inputs, 4)[:, 0].T)
 
 
-def dugoff_drive(seconds=20.0, seed=0, noise=1.0, name="drive", *, straight=0.0):
+def dugoff_drive(seconds=20.0, seed=0, name="drive", *, straight=0.0):
     """A drive up to the limit at 100 Hz, with accelerations and all four lateral forces.
 
     Its last seconds lead straight ahead.
@@ -53,7 +53,7 @@ def dugoff_drive(seconds=20.0, seed=0, noise=1.0, name="drive", *, straight=0.0)
     vy, true_yaw_rate, ay, yaw_rate, front, rear = driven(np.stack([vx, steer, ax], 1))
 
     def measured(values, level):
-        return values + noise * level * generator.standard_normal(len(time))
+        return values + level * generator.standard_normal(len(time))
 
     channels = {
         "vx": vx,

@@ -2,6 +2,8 @@
 noise.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from vehest.data.recording import Recording
@@ -62,12 +64,4 @@ def rational_drive(seconds=60.0, seed=0, stiffness=1.0, friction=1.0, rate_hz=20
 
 def changed(drive, channels):
     """The same drive with other samples of some channels; NaN is not measured."""
-    return Recording(
-        drive.id,
-        drive.vehicle,
-        drive.rate_hz,
-        drive.start_time,
-        {**drive.channels, **channels},
-        drive.kind,
-        frozenset(("ay", "yaw_rate")),
-    )
+    return replace(drive.with_channels(channels), gappy=frozenset(("ay", "yaw_rate")))

@@ -1,5 +1,7 @@
 """Drives of a car that is the linear single track itself, noise included, with known states."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from vehest.data.recording import Recording
@@ -45,12 +47,4 @@ def with_gaps(drive, gaps):
     channels = {name: samples.copy() for name, samples in drive.channels.items()}
     for name, gap in gaps.items():
         channels[name][gap] = np.nan
-    return Recording(
-        drive.id,
-        drive.vehicle,
-        drive.rate_hz,
-        drive.start_time,
-        channels,
-        drive.kind,
-        frozenset(gaps),
-    )
+    return replace(drive, channels=channels, gappy=frozenset(gaps))

@@ -17,7 +17,7 @@ NOISE = {"ax": 0.4, "ay": 0.4, "yaw_rate": 0.02, "motor_speed": 0.4}
 
 
 @cache
-def small_car_drive(seconds=4.0, seed=0, noise=1.0):
+def small_car_drive(seconds=4.0, seed=0):
     """Swerves at 2 to 4 m/s, tyres that saturate.
 
     Measurements with noise of a small car's sensors.
@@ -42,7 +42,7 @@ def small_car_drive(seconds=4.0, seed=0, noise=1.0):
     ax, ay = np.array(accelerations).T
     true = {"ax": ax, "ay": ay, "yaw_rate": turning, "motor_speed": rim / WHEEL_RADIUS}
     measured = {
-        name: values + noise * NOISE[name] * generator.standard_normal(len(time))
+        name: values + NOISE[name] * generator.standard_normal(len(time))
         for name, values in true.items()
     }
     channels = {

@@ -431,11 +431,11 @@ GRADIENT = (
 )  # steady state: δ = L/R + K·ay
 
 
-def single_track(ratio, offset, seed=0):
+def single_track(ratio, offset):
     """Calm country-road driving of the linear single-track model, integrated with its lags, seen by
     noisy sensors.
     """
-    generator = np.random.default_rng(seed)
+    generator = np.random.default_rng(0)
     step = 0.01
     time = np.arange(20000) * step
     speed = 20.0 + 8.0 * np.sin(2.0 * np.pi * 0.013 * time)
@@ -493,9 +493,7 @@ def test_steering_intervals_contain_the_truth():
             [1.0, -0.998],
             generator.standard_normal(len(road) + 5000),
         )[5000:]  # 5 s
-        recording = replace(
-            road, channels={**road.channels, "handwheel": road["handwheel"] + wander}
-        )
+        recording = road.with_channels({"handwheel": road["handwheel"] + wander})
         ratio = align(recording, AlignmentSettings(("steering_ratio",), wheelbase=WHEELBASE))[
             "steering_ratio"
         ]

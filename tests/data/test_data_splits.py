@@ -39,9 +39,8 @@ def spans(draw):
     return Span("set", draw(st.sampled_from(["lap1", "lap2"])), start, stop)
 
 
-BASE = {
-    "name": "s",
-    "dataset": "d",
+HEAD = {"name": "s", "dataset": "d"}
+BASE = HEAD | {
     "train": [{"recording": "a"}],
     "validation": [{"recording": "b"}],
     "tests": {},
@@ -183,11 +182,8 @@ def test_shipped_splits_are_valid(file):
             "sideslip_ref": np.zeros(20_000),
         }
 
-        def reader(name):
-            drive = Recording(name, "car", 20.0, 0.0, long)
-            return lambda channels: drive if channels is None else drive.select(channels)
-
-        return {name: reader(name) for name in names}
+        drives = [Recording(name, "car", 20.0, 0.0, long) for name in names]
+        return catalogue_of(*drives)(dataset)
 
     text = file.read_text(encoding="utf-8")
     config = yaml.safe_load(text)
@@ -196,35 +192,35 @@ def test_shipped_splits_are_valid(file):
     assert set(dataset_names(config)) == set(split.datasets)
 
 
+def catalogue_of(*recordings):
+    """These recordings as the catalogue of any data set."""
+
+    def reader(recording):
+        return lambda channels: recording if channels is None else recording.select(channels)
+
+    return lambda dataset: {recording.id: reader(recording) for recording in recordings}
+
+
 def drives(ay, vx=None, start_time=0.0):
     """A catalogue of data set ``d``, or of any, with drives at 100 Hz of a given ay."""
 
-    def reader(name):
-        everything = {"ay": np.array(ay[name]), "vx": np.array(vx or [10.0] * len(ay[name]))}
+    recordings = []
+    for name, samples in ay.items():
+        channels = {"ay": np.array(samples), "vx": np.array(vx or [10.0] * len(samples))}
         gappy = frozenset({"ay"})
-        recording = Recording(name, "car", 100.0, start_time, everything, gappy=gappy)
-        return lambda channels: recording.select(channels)
-
-    return lambda dataset: {name: reader(name) for name in ay}
+        recordings.append(Recording(name, "car", 100.0, start_time, channels, gappy=gappy))
+    return catalogue_of(*recordings)
 
 
 def selected_ranges(keep, catalogue, **entry):
     """A split whose training is cut by a condition."""
     train = {"recordings": "train_*", **entry, "keep": keep}
-    return split_from_config(
-        {"name": "s", "dataset": "d", "train": [train], "validation": [{"recording": "v"}]},
-        catalogue,
-    )
+    return split_from_config(BASE | {"train": [train]}, catalogue)
 
 
 def test_patterns_name_recordings_in_order_and_ask_for_a_data_set_once():
     catalogue = drives({name: [0.0] * 10 for name in ("train_b", "test_a", "train_a", "Train_c")})
-    config = {
-        "name": "s",
-        "dataset": "d",
-        "train": [{"recordings": "train_*", "start": 1}],
-        "validation": [{"recording": "v"}],
-    }
+    config = BASE | {"train": [{"recordings": "train_*", "start": 1}]}
     assert split_from_config(config, catalogue).train == (
         Span("d", "train_a", 1.0),
         Span("d", "train_b", 1.0),
@@ -235,12 +231,7 @@ def test_patterns_name_recordings_in_order_and_ask_for_a_data_set_once():
         requested.append(dataset)
         return drives({"a1": [0.0] * 10, "b1": [0.0] * 10})(dataset)
 
-    plain = {
-        "name": "s",
-        "dataset": "d",
-        "train": [{"recording": "a1"}],
-        "validation": [{"recording": "b1"}],
-    }
+    plain = {**HEAD, "train": [{"recording": "a1"}], "validation": [{"recording": "b1"}]}
     split_from_config(plain, catalogue)
     assert requested == []
     split_from_config(
@@ -427,13 +418,6 @@ def circuit(name="lap", laps=4.3, start_time=1600000000.0, rate_hz=20.0):
     ), length
 
 
-def catalogue_of(*recordings):
-    def reader(recording):
-        return lambda channels: recording if channels is None else recording.select(channels)
-
-    return lambda dataset: {recording.id: reader(recording) for recording in recordings}
-
-
 def test_laps_last_a_round_and_count_from_either_end():
     recording, length = circuit()
     laps = laps_of(recording)
@@ -447,8 +431,7 @@ def test_laps_last_a_round_and_count_from_either_end():
     assert all(earlier[1] == later[0] for earlier, later in pairwise(laps))
     entry = {"recording": "lap"}
     config = {
-        "name": "s",
-        "dataset": "d",
+        **HEAD,
         "train": [{**entry, "laps": "first 2"}],
         "validation": [{**entry, "laps": "3"}],
     }
@@ -491,8 +474,7 @@ def test_percentages_are_consecutive_over_every_recording():
     first = Recording("a", "car", 10.0, 50.0, {"vx": np.ones(1000)})
     second = Recording("b", "car", 10.0, 0.0, {"vx": np.ones(200)})
     config = {
-        "name": "s",
-        "dataset": "d",
+        **HEAD,
         "train": "60 %",
         "validation": "15%",
         "tests": {"wet": "20 %", "dry": "5 %"},
@@ -506,7 +488,7 @@ def test_percentages_are_consecutive_over_every_recording():
 
 def test_every_fold_is_tested_once_and_none_learns_from_its_test():
     recording, _ = circuit(laps=6.5)
-    config = {"name": "s", "dataset": "d", "folds": {"number": 4, "of": "laps", "gap_seconds": 1.0}}
+    config = {**HEAD, "folds": {"number": 4, "of": "laps", "gap_seconds": 1.0}}
     splits = [
         split_from_config({**config, "fold": fold}, catalogue_of(recording)) for fold in range(4)
     ]
@@ -534,7 +516,7 @@ def test_folds_of_recordings_and_of_seconds_leave_nothing_out(of):
         Recording(name, "car", 10.0, 0.0, {"vx": np.ones(1000), "yaw_rate": np.zeros(1000)})
         for name in "abcdef"
     ]
-    config = {"name": "s", "dataset": "d", "folds": {"number": 3, "of": of, "gap_seconds": 0.0}}
+    config = {**HEAD, "folds": {"number": 3, "of": of, "gap_seconds": 0.0}}
     for fold in range(3):
         split = split_from_config({**config, "fold": fold}, catalogue_of(*recordings))
         length = {
@@ -601,16 +583,14 @@ def test_folds_are_never_scraps_and_gaps_stay_complete():
     recording, _ = circuit(laps=6.5)
     for number in (3, 5):
         config = {
-            "name": "s",
-            "dataset": "d",
+            **HEAD,
             "folds": {"number": number, "of": "laps", "gap_seconds": 3.0},
         }
         for fold in range(number):
             split = split_from_config({**config, "fold": fold}, catalogue_of(recording))
             assert min(span.stop - span.start for span in split.tests["test"]) > 30.0
     short = {
-        "name": "s",
-        "dataset": "d",
+        **HEAD,
         "folds": {"number": 3, "of": "seconds", "block_seconds": 1.0, "gap_seconds": 2.0},
     }
     split = split_from_config(
@@ -684,7 +664,7 @@ def split_of(**changed):
     shares = {"train": "60 %", "validation": "20 %", "tests": {"test": "20 %"}}
     return split_from_config(
         {"name": "mine", "dataset": "d", **shares, **changed},
-        lambda _: {"lap": lambda channels: drive},
+        catalogue_of(drive),
     )
 
 

@@ -28,12 +28,12 @@ def fitted(name, drive, **settings):
     return estimator, record
 
 
-def steady_drive(car, seconds=30.0):
+def steady_drive(car):
     """Steady cornering of the linear single track at several speeds and steering angles: v and r
     solve 0 = A x + B δ at each sample.
     """
     generator = np.random.default_rng(3)
-    vx = generator.uniform(8.0, 35.0, round(20 * seconds))
+    vx = generator.uniform(8.0, 35.0, 600)
     steer = generator.uniform(-0.05, 0.05, len(vx))
     matrix, steering, *_ = lateral_model(car, vx)
     states = -np.linalg.solve(matrix, (steering * steer[:, None])[..., None])[..., 0]

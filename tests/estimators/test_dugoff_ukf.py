@@ -3,7 +3,6 @@ forces and without.
 """
 
 import sys
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +11,7 @@ from refusals import refusal
 from conftest import stop_after
 from dugoff_drive import NOISE, TYRES, dugoff_drive
 from every_estimator import online_rows
+from single_track_drive import with_gaps
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.estimators.base import FitData
 from vehest.estimators.cnn_ukf import CnnUkf, EndToEndSettings
@@ -30,10 +30,6 @@ def estimator_with(inputs="full", **settings):
     """A filter that knows the car it is on."""
     noise = LEVELS | (FORCES if inputs == "full" else {})
     return DugoffUkf.from_config({"inputs": inputs, "tyres": TYRES, "noise": noise, **settings})
-
-
-def changed(drive, channels, gappy=()):
-    return replace(drive, channels={**drive.channels, **channels}, gappy=frozenset(gappy))
 
 
 def test_the_fit_finds_tyres_and_noise_with_measured_forces_and_without():
@@ -104,16 +100,11 @@ def test_drives_of_any_length_are_independent_and_force_trust_has_hysteresis():
 
 def test_online_agrees_with_batch_through_gaps_and_standstill():
     drive = dugoff_drive(6.0, 7)
-    gap = drive["ay"].copy()
     slow = drive["vx"].copy()
-    gap[150:220] = np.nan
     slow[300:380] = np.linspace(20.0, -1.0, 80)
     slow[380:420] = np.linspace(-1.0, 15.0, 40)
-    drive = changed(
-        drive,
-        {"ay": gap, "vx": slow, "fy_fl": np.where(np.arange(600) % 7, drive["fy_fl"], np.nan)},
-        ("ay", "fy_fl"),
-    )
+    gaps = {"ay": slice(150, 220), "fy_fl": slice(None, None, 7)}
+    drive = with_gaps(drive.with_channels({"vx": slow}), gaps)
     estimator = estimator_with()
     batch = estimator.estimate([drive.without_references()])[0]
     online = online_rows(estimator, drive)
@@ -172,16 +163,16 @@ def test_levels_come_from_moving_samples_and_are_tuned_on_the_scored_reference()
         "steer": np.where(is_standing, 0.0, drive["steer"]),
     }
     record = DugoffUkf.from_config({"inputs": "imu", "tyres": TYRES}).fit(
-        FitData([changed(drive, quiet)], []), QUICK
+        FitData([drive.with_channels(quiet)], []), QUICK
     )
     assert record.metrics["noise_ay"] > 0.8 * NOISE["ay"]
-    gap = changed(drive, {"ax": np.where(is_standing, np.nan, drive["ax"])}, ("ax",))
+    gap = with_gaps(drive, {"ax": is_standing})
     assert "recording 'drive': channel 'ax' has gaps" in refusal(
         lambda: DugoffUkf.from_config({}).fit(FitData([gap], []), QUICK)
     )
     drive = dugoff_drive(3.0)
     data = IdentificationSettings(method="data")
-    with_sideslip_error = changed(drive, {"sideslip_ref": drive["sideslip_ref"] + 0.1})
+    with_sideslip_error = drive.with_channels({"sideslip_ref": drive["sideslip_ref"] + 0.1})
     losses = [
         estimator_with().fit(FitData([], [recording]), data).metrics["best_validation_loss"]
         for recording in (drive, with_sideslip_error)

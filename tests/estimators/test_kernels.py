@@ -29,7 +29,7 @@ STRUCTURES = [
 ]
 
 
-def _problem(estimator, dtype, members=3, batch=70):
+def _problem(estimator, dtype, members=3):
     """Parameters of several members, windows of each, and the series.
 
     Batch is no multiple of the lanes.
@@ -44,11 +44,11 @@ def _problem(estimator, dtype, members=3, batch=70):
         rows.append(layout.pack([network])[0])
     flat = torch.stack(rows).requires_grad_()
     starts = torch.randint(
-        0, len(windows), (members, batch), generator=torch.Generator().manual_seed(9)
+        0, len(windows), (members, 70), generator=torch.Generator().manual_seed(9)
     )
     series = prepare(network, torch.as_tensor(windows.series, dtype=dtype))
     weights = torch.randn(
-        members, batch, generator=torch.Generator().manual_seed(10), dtype=torch.float64
+        members, 70, generator=torch.Generator().manual_seed(10), dtype=torch.float64
     ).to(dtype)
 
     def value_and_gradient(compiled):

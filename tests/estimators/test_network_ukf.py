@@ -71,15 +71,15 @@ def filter_alone(estimator):
     return alone
 
 
-def end_to_end(batch_size=4, dropout=0.0):
+def end_to_end():
     """An untrained network in double precision, and its training through the filter."""
-    estimator = estimator_of("cnn_ukf", dropout=dropout)
+    estimator = estimator_of("cnn_ukf", dropout=0.0)
     raw = learnt_samples(DATA.train, estimator.network_inputs, estimator.name)
     estimator.network.double().scale(*raw)
     estimator.network.reset([torch.Generator().manual_seed(0)])
     with torch.no_grad():
         estimator.network.get_parameter("bias_3")[0, 1:] = torch.tensor([-4.0, -6.0, -6.0])
-    training = EndToEndSettings(steps=30, batch_size=batch_size)
+    training = EndToEndSettings(steps=30, batch_size=4)
     return estimator, EndToEnd(estimator, estimator.network.samples(*raw), DATA.train, training)
 
 

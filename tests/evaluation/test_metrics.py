@@ -3,7 +3,6 @@ errors are known.
 """
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -37,8 +36,8 @@ from vehest_papers.cnn_ukf.manoeuvres import (
 )
 
 
-def _estimate(times, vy, rate_hz, start):
-    return Estimate("drive", "test", rate_hz, start, {"vy": vy, "sideslip": np.zeros(len(vy))})
+def _estimate(vy, rate_hz=20.0):
+    return Estimate("drive", "test", rate_hz, 0.0, {"vy": vy, "sideslip": np.zeros(len(vy))})
 
 
 def test_accuracy_has_the_values_of_a_hand_calculation_and_wraps_angles():
@@ -92,13 +91,11 @@ def test_scoring_starts_after_warm_up_at_speed_without_offset(drive):
     assert figures["fvu"] == pytest.approx(0.0, abs=1e-12)
     assert figures["rmse_vy"] == pytest.approx(0.5)
     vy = np.where(drive.time < 11.5 - 1e-9, 1e6, drive["vy_ref"])
-    scored = score(
-        _estimate(drive.time, vy, 20.0, 0.0), drive, Span("d", "drive", 10.0, 30.0), Protocol()
-    )
+    scored = score(_estimate(vy), drive, Span("d", "drive", 10.0, 30.0), Protocol())
     assert accuracy([scored])["rmse_vy"] == 0.0
     drive = planar_drive(noise=0.3)
     scored = score(
-        _estimate(drive.time, drive["vy_ref"] + 1.0, 20.0, 0.0),
+        _estimate(drive["vy_ref"] + 1.0),
         drive,
         Span("d", "drive"),
         Protocol(),
@@ -136,12 +133,12 @@ def test_weighted_metrics_match_a_hand_calculation():
 def test_faster_estimates_use_the_latest_past_sample(drive):
     """A 100 Hz estimate is read at 20 Hz at the same instant; one that starts late is held."""
     times = np.arange(0, 60, 0.01)
-    estimate = _estimate(times, times.copy(), 100.0, 0.0)
+    estimate = _estimate(times.copy(), 100.0)
     scored = score(estimate, drive, Span("d", "drive", 10.0, 20.0), Protocol(20.0, 10.0, 1.5))
     assert scored.time[0] == pytest.approx(11.5)
     assert scored.time[-1] == pytest.approx(19.95)
     assert np.allclose(scored.vy, scored.time, atol=1e-9)
-    slow = _estimate(times[::50], times[::50].copy(), 2.0, 0.0)
+    slow = _estimate(times[::50].copy(), 2.0)
     slow_score = score(slow, drive, Span("d", "drive", 10.0, 20.0), Protocol(20.0, 10.0, 1.5))
     assert np.allclose(slow_score.vy, np.floor(slow_score.time * 2 + 1e-6) / 2)
     assert (slow_score.vy <= slow_score.time + 1e-9).all()
@@ -153,13 +150,13 @@ def stopping(drive):
     vy = drive["vy_ref"].copy()
     vx[500:510] = 0.0003
     vy[500:510] = 0.0
-    return replace(drive, channels={**drive.channels, "vx": vx, "vy_ref": vy})
+    return drive.with_channels({"vx": vx, "vy_ref": vy})
 
 
 def test_sideslip_at_standstill_is_left_out_of_the_mean_and_lateral_velocity_is_not(drive):
     """An error of 0.1 m/s everywhere; at 0.0003 m/s it would be a sideslip of 90 degrees."""
     recording = stopping(drive)
-    estimate = _estimate(recording.time, recording["vy_ref"] + 0.1, 20.0, 0.0)
+    estimate = _estimate(recording["vy_ref"] + 0.1)
     everywhere, moving = (
         accuracy([score(estimate, recording, Span("d", "drive"), protocol)])
         for protocol in (Protocol(min_sideslip_speed=0.0), Protocol())
@@ -178,8 +175,8 @@ def test_sideslip_at_standstill_is_left_out_of_the_mean_and_lateral_velocity_is_
 
 def test_standing_car_has_an_error_of_lateral_velocity_alone(drive):
     at_rest = {"vx": np.zeros(len(drive)), "vy_ref": np.zeros(len(drive))}
-    recording = replace(drive, channels={**drive.channels, **at_rest})
-    estimate = _estimate(recording.time, np.full(len(recording), 0.1), 20.0, 0.0)
+    recording = drive.with_channels(at_rest)
+    estimate = _estimate(np.full(len(recording), 0.1))
     part = score(estimate, recording, Span("d", "drive"), Protocol())
     figures = accuracy([part])
     assert (figures["rmse_vy"], figures["share_below_min_speed"]) == (pytest.approx(0.1), 1.0)
@@ -206,13 +203,13 @@ def test_an_estimate_with_holes_has_no_score(drive):
     vy = drive["vy_ref"].copy()
     vy[500] = np.nan
     assert "has no estimate for 1 of" in refusal(
-        lambda: score(_estimate(drive.time, vy, 20.0, 0.0), drive, Span("d", "drive"), Protocol())
+        lambda: score(_estimate(vy), drive, Span("d", "drive"), Protocol())
     )
 
 
 def test_without_lateral_acceleration_all_but_the_nonlinear_range_is_scored(drive):
     without = drive.select([name for name in drive.channels if name != "ay"])
-    estimate = _estimate(drive.time, drive["vy_ref"] + 0.1 * np.sin(drive.time), 20.0, 0.0)
+    estimate = _estimate(drive["vy_ref"] + 0.1 * np.sin(drive.time))
     figures, expected = (
         accuracy([score(estimate, recording, Span("d", "drive", 10.0, 30.0), Protocol())])
         for recording in (without, drive)
@@ -223,7 +220,7 @@ def test_without_lateral_acceleration_all_but_the_nonlinear_range_is_scored(driv
         name: value for name, value in expected.items() if name not in blank
     }
     part = score(
-        _estimate(drive.time, drive["vy_ref"] + 0.1, 20.0, 0.0),
+        _estimate(drive["vy_ref"] + 0.1),
         without,
         Span("d", "drive"),
         Protocol(),
@@ -304,7 +301,7 @@ def test_lever_arms_end_at_half_a_metre_and_need_a_turn():
     assert values["lever_arm"] == -MAX_LEVER_ARM
     yaw_rate = recording["yaw_rate"][-round((N / RATE - 1.5) * RATE) :]
     assert values["rmse_vy"] == pytest.approx(0.8 * np.sqrt(np.mean(yaw_rate**2)), rel=1e-9)
-    straight = replace(recording, channels={**recording.channels, "yaw_rate": np.zeros(N)})
+    straight = recording.with_channels({"yaw_rate": np.zeros(N)})
     values = figures(straight, recording["vy_ref"] + 0.1)
     assert (values["lever_arm"], values["rmse_vy"]) == (0.0, pytest.approx(0.1))
 

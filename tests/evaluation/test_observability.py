@@ -14,16 +14,15 @@ def moved(x, u):
     return torch.stack([x[0] + STEP * x[1], x[1] + u[0]])
 
 
-def along(observation, *, transition=moved, states=None, sizes=(1.0, 1.0), noise=(1.0,), steps=2):
-    states = np.zeros((5, 2)) if states is None else states
+def along(observation, *, sizes=(1.0, 1.0), noise=(1.0,)):
     return observability_along(
-        transition,
+        moved,
         observation,
-        states,
-        np.zeros((len(states), 1)),
+        np.zeros((5, 2)),
+        np.zeros((5, 1)),
         sizes=np.array(sizes),
         noise=np.array(noise),
-        steps=steps,
+        steps=2,
     )
 
 

@@ -72,11 +72,11 @@ def test_segments_reproduce_the_metrics(tmp_path):
     assert "start" in refusal(lambda: read_segments(tmp_path / "blocks.csv"))
 
 
-def with_stop(part, seconds=12.0):
+def with_stop(part):
     """The same range with a stop at its end, in which sideslip is not scored and its error is 90
     degrees.
     """
-    n = round(seconds * RATE)
+    n = round(12.0 * RATE)
     columns = {"vy": 0.0, "vy_ref": 0.0, "sideslip": np.pi / 2, "sideslip_ref": 0.0, "ay": 0.0}
     stopped = {
         name: np.append(getattr(part, name), np.full(n, value)) for name, value in columns.items()

@@ -22,13 +22,13 @@ LENGTH = 100
 LEVEL = 1e6  # added to losses, so that roots are defined and linear in what is added to them
 
 
-def losses(generator, n_seeds, seed_level=0.0, has_seed_noise=False):
-    """Autocorrelated noise (0.95 from one sample to the next), common to the seeds or their own,
+def losses(generator, n_seeds, seed_level=0.0):
+    """Autocorrelated noise (0.95 from one sample to the next), common to the seeds,
     and a level of each seed.
     """
-    white = generator.standard_normal((n_seeds if has_seed_noise else 1, N_SEQUENCES, LENGTH))
-    noise = signal.lfilter([1.0], [1.0, -0.95], white, axis=2)
-    return noise.reshape(len(noise), -1) + seed_level * generator.standard_normal((n_seeds, 1))
+    white = generator.standard_normal((N_SEQUENCES, LENGTH))
+    noise = signal.lfilter([1.0], [1.0, -0.95], white)
+    return noise.ravel() + seed_level * generator.standard_normal((n_seeds, 1))
 
 
 def compared(first, second, lengths=(LENGTH,) * N_SEQUENCES, n_resamples=400):

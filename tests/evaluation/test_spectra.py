@@ -2,8 +2,6 @@
 planted.
 """
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from refusals import refusal
@@ -59,7 +57,7 @@ def test_sinusoids_stand_in_their_bin_and_recordings_count_by_segments():
 def test_planted_biases_and_noise_are_the_process_noise_of_the_documented_rate(drive):
     hz = 1.0
     time = drive.time
-    waving = replace(drive, channels={**drive.channels, "vy_ref": np.sin(2 * np.pi * hz * time)})
+    waving = drive.with_channels({"vy_ref": np.sin(2 * np.pi * hz * time)})
     shrunk = np.sin(2 * np.pi * hz / RATE) / (2 * np.pi * hz / RATE)
     np.testing.assert_allclose(
         lateral_velocity_rate(waving),
@@ -71,12 +69,12 @@ def test_planted_biases_and_noise_are_the_process_noise_of_the_documented_rate(d
     # derivative, 3e-4 m/s² here.
     drive = planar_drive()
     assert np.abs(process_noise(drive)).max() < 1e-3
-    tilted = replace(drive, channels={**drive.channels, "ay": drive["ay"] - 0.1})
+    tilted = drive.with_channels({"ay": drive["ay"] - 0.1})
     assert mean_bias([tilted]) == pytest.approx(0.1, abs=2e-4)
     assert mean_bias([tilted, drive]) == pytest.approx(0.05, abs=2e-4)
     drive = planar_drive(seconds=600.0)
     noise = 0.4 * np.random.default_rng(3).standard_normal(len(drive))
-    noisy = replace(drive, channels={**drive.channels, "ay": drive["ay"] + noise})
+    noisy = drive.with_channels({"ay": drive["ay"] + noise})
     density = periodogram([process_noise(noisy)], RATE)
     assert density.level(1.0) == pytest.approx(
         0.4**2 / 10.0, rel=4 / np.sqrt(6 * density.n_segments)

@@ -76,8 +76,8 @@ def pendulum_with_radar(gravity=9.81):
     return NonlinearModel(transition, observation, constant(process), constant(noise))
 
 
-def measured_pendulum(steps=40, sequences=1, seed=1):
-    generator = torch.Generator().manual_seed(seed)
+def measured_pendulum(steps=40, sequences=1):
+    generator = torch.Generator().manual_seed(1)
     model = pendulum_with_radar()
     x = torch.tensor([0.6, 0.0, 0.3], dtype=torch.float64).expand(sequences, 3)
     inputs = torch.randn(sequences, steps, 1, generator=generator, dtype=torch.float64)

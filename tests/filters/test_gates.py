@@ -119,8 +119,8 @@ def test_a_gate_that_refuses_nothing_changes_no_bit():
     assert torch.equal(without.covariance, within.covariance)
 
 
-def outliers(steps, sequences):
-    y, u, first = measured_pendulum(steps, sequences)
+def outliers(sequences):
+    y, u, first = measured_pendulum(30, sequences)
     y[0, 5, 0] = 40.0
     y[0, 9, 1] = -40.0
     y[-1, 12] = 1e3
@@ -130,7 +130,7 @@ def outliers(steps, sequences):
 
 
 def test_scan_and_readable_filter_refuse_the_same_samples():
-    y, u, first = outliers(30, 3)
+    y, u, first = outliers(3)
     gate = Gate(4.0, PATIENCE)
     scanned = pendulum(y, u, first, gate).steps
     for row in range(3):
@@ -147,7 +147,7 @@ def test_scan_and_readable_filter_refuse_the_same_samples():
 
 
 def test_gradients_through_a_gate_are_those_of_missing_measurements():
-    y, u, first = outliers(30, 2)
+    y, u, first = outliers(2)
     weights = torch.randn(2, 30, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
     is_accepted = pendulum(y, u, first, Gate(4.0, PATIENCE)).steps.measured
     assert not is_accepted.all()

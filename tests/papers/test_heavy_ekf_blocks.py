@@ -3,7 +3,6 @@ shows.
 """
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -137,7 +136,7 @@ def test_wheel_speeds_of_a_drive_in_bends_come_together(tmp_path):
 def test_measured_values_have_the_ids_of_the_papers_claims():
     drive = short_drive(120.0)
     speed = np.where(drive.time < 110.0, 10.0, 0.0)
-    drive = replace(drive, channels={**drive.channels, "ay": 2.0 * drive["ay"], "vx_ref": speed})
+    drive = drive.with_channels({"ay": 2.0 * drive["ay"], "vx_ref": speed})
     tests = ("nominal_laps", "worn_laps", "wet_laps")
     estimates = {test: {name: scaled(drive, 0.8) for name in ("RATTE", "zero")} for test in tests}
     rows = block_errors.measured_rows("truck", dict.fromkeys(tests, drive), estimates, 2.0)

@@ -127,9 +127,7 @@ def test_search_finds_levels_as_good_as_the_simulated_noise_levels():
 def test_first_seconds_and_slow_samples_are_not_scored():
     recording = drive(Conditions(3.0), 1, 20.0).recording
     speed = np.where(np.arange(len(recording)) < 100, recording["vx"], 1.0)
-    measured = measured_drive(
-        replace(recording, channels={**recording.channels, "vx": speed}), CURVES
-    )
+    measured = measured_drive(recording.with_channels({"vx": speed}), CURVES)
     assert measured.is_scored.sum() == 70
     wrong = measured.sideslip + np.where(measured.is_scored, math.radians(0.3), 1.0)
     assert measured.rmse(wrong) == pytest.approx(0.3)

@@ -26,7 +26,7 @@ OFFSET = 0.2
 SECONDS = 240.0
 
 
-def scheme(folder, *, bias=False):
+def scheme(folder):
     """A linear KS-NN and v = 0 on a car measured as it is, and on another whose a_y shows too
     little.
     """
@@ -35,8 +35,8 @@ def scheme(folder, *, bias=False):
     }
     for seed, name in ((5, "f1"), (6, "f2")):
         drive = planar_drive(SECONDS, seed=seed, name=name)
-        drives[name] = replace(drive, channels={**drive.channels, "ay": drive["ay"] - OFFSET})
-    network = ksnn_with_weights(n_local=2, bias=bias)
+        drives[name] = drive.with_channels({"ay": drive["ay"] - OFFSET})
+    network = ksnn_with_weights(n_local=2, bias=False)
     zero = estimator_class("zero").from_config({"rate_hz": 20.0})
     spans = {name: (Span("cars", name),) for name in drives}
     split = Split("scheme", spans["c1"], spans["f1"], {"c2": spans["c2"], "f2": spans["f2"]})

@@ -6,12 +6,12 @@ import math
 
 import numpy as np
 import pytest
+from study_parts import study_of, tables_of, text_of
 
 from real_drives import real_drive
 from vehest.data.recording import Recording
 from vehest.data.store import write_recording
-from vehest.report.document import Table
-from vehest.studies.artefacts import StoredDataset, StudyArtefacts
+from vehest.studies.artefacts import StoredDataset
 from vehest_papers.real_cars.document import documents
 from vehest_papers.real_cars.planted import detections, planted_faults
 from vehest_papers.real_cars.statistics import statistics_of
@@ -79,16 +79,12 @@ def test_report_names_the_data_sets_that_can_rank_and_why_the_others_cannot(tmp_
                 name, name, "real", {}, {"lap": tmp_path / f"{name}.parquet"}, "none", "nobody"
             )
         )
-    (report,) = documents(
-        StudyArtefacts("real_cars", "Real cars", "", "vehest run real_cars", datasets=datasets)
-    ).values()
-    text = " ".join(block for block in report.blocks if isinstance(block, str))
-    text = " ".join(text.split())
+    (report,) = documents(study_of("real_cars", datasets=datasets)).values()
+    text = text_of(report)
     assert "1 of 2 data sets can rank estimators: `long` (real)." in text
     assert "`short` cannot: 40 s of driving." in text
     assert "injected" not in text, "errors are injected into the Ferrari's drive alone"
-    tables = {block.name: block for block in report.blocks if isinstance(block, Table)}
-    assert set(tables) == {"overview", "findings_by_check"}
+    assert set(tables_of(report)) == {"overview", "findings_by_check"}
     assert set(report.data) == {"recordings", "findings", "licences"}
     reasons = report.data["recordings"].set_index("dataset")["reasons"]
     assert dict(reasons) == {"long": "", "short": "40 s of driving"}
@@ -99,20 +95,14 @@ def test_report_of_the_ferrari_counts_the_injected_errors(tmp_path):
     file = tmp_path / "lap.parquet"
     write_recording(drive(seconds=710.0, name="lap"), file)
     dataset = StoredDataset("ferrari_250lm", "Ferrari", "real", {}, {"lap": file}, "none", "nobody")
-    (report,) = documents(
-        StudyArtefacts("real_cars", "Real cars", "", "vehest run real_cars", datasets=[dataset])
-    ).values()
+    (report,) = documents(study_of("real_cars", datasets=[dataset])).values()
     cases = report.data["injected"]
     detectable = cases[cases["detectable"]]
-    first = next(block for block in report.blocks if isinstance(block, str))
-    assert f"detect {detectable['detected'].sum()} of {len(detectable)} errors" in " ".join(
-        first.split()
-    )
-    (table,) = (
-        block for block in report.blocks if getattr(block, "name", "") == "injected_by_error"
-    )
-    assert table.frame["cases"].sum() == len(cases)
-    assert table.frame["detected"].sum() == detectable["detected"].sum() > 0
+    n_detected = detectable["detected"].sum()
+    assert f"detect {n_detected} of {len(detectable)} errors" in text_of(report)
+    table = tables_of(report)["injected_by_error"]
+    assert table["cases"].sum() == len(cases)
+    assert table["detected"].sum() == n_detected > 0
 
 
 def noise():

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from refusals import refusal
-from study_parts import metric_rows, part_of
+from study_parts import metric_rows, part_of, study_of, tables_of, text_of
 
 from conftest import planar_drive
 from vehest.configuration.composition import compose_config
@@ -20,9 +20,9 @@ from vehest.data.store import write_estimate, write_recording
 from vehest.estimators.model_files import save_model
 from vehest.estimators.registry import estimator_class
 from vehest.evaluation.metrics import Protocol, accuracy, score
-from vehest.report.document import Table, write_document
+from vehest.report.document import write_document
 from vehest.sources.base import kind_of, open_source
-from vehest.studies.artefacts import EvaluatedModel, StudyArtefacts
+from vehest.studies.artefacts import EvaluatedModel
 from vehest_papers.sim_to_real import documents
 
 PROTOCOL = Protocol(rate_hz=20.0)
@@ -161,9 +161,7 @@ def part(folder, name):
 def artefacts(tmp_path_factory):
     folder = tmp_path_factory.mktemp("toy")
     parts = {name: part(folder, name) for name in ERRORS}
-    return StudyArtefacts(
-        "toy", "Toy", "About.", "vehest run toy", {name: name.title() for name in ERRORS}, parts, []
-    )
+    return study_of("toy", parts, titles={name: name.title() for name in ERRORS})
 
 
 @pytest.fixture(scope="module")
@@ -174,7 +172,7 @@ def document(artefacts):
 @pytest.fixture
 def steps(document):
     """Table ``overview``."""
-    (table,) = (block.frame for block in document.blocks if isinstance(block, Table))
+    (table,) = tables_of(document).values()
     return table.set_index("step", verify_integrity=True)
 
 
@@ -211,7 +209,7 @@ def test_report_lists_baselines_and_counts_candidates_worse_on_the_third_choice(
         > 1.0
         > steps.loc["Level: KS-NN", "other_simulator_fvu"]
     )
-    assert any("1 of 2 candidates of the third choice are worse" in str(b) for b in document.blocks)
+    assert "1 of 2 candidates of the third choice are worse" in text_of(document)
 
 
 def test_report_states_errors_of_each_choice_and_whether_the_first_suffices(

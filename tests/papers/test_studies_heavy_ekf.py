@@ -1,7 +1,6 @@
 """Measures of the study of heavy-vehicle laps, on a short drive."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -74,7 +73,7 @@ def test_errors_that_double_on_the_last_lap_have_a_log_change_of_their_squares()
 def test_error_before_the_stop_leaves_the_last_moments_out():
     drive = short_drive(60.0)
     speed = np.where(drive.time < 40.0, 10.0, 0.0)
-    stops = replace(drive, channels={**drive.channels, "vx_ref": speed})
+    stops = drive.with_channels({"vx_ref": speed})
     wrong = np.radians(np.where(drive.time > 39.58, 50.0, np.where(drive.time > 34.98, 0.3, 7.0)))
     sideslip = drive["sideslip_ref"] + wrong
     estimate = Estimate(drive.id, "late", RATE, 0.0, {"vy": sideslip, "sideslip": sideslip})

@@ -11,7 +11,15 @@ import pandas as pd
 import pytest
 import torch
 from refusals import refusal
-from study_parts import metric_rows, part_of, stored
+from study_parts import (
+    figures_of,
+    first_screen,
+    metric_rows,
+    part_of,
+    stored,
+    study_of,
+    tables_of,
+)
 
 from place import undrawn
 from vehest.data.estimate import Estimate
@@ -28,8 +36,8 @@ from vehest.evaluation.metrics import (
     score_all,
     sequences,
 )
-from vehest.report.document import Figure, Table, write_document
-from vehest.studies.artefacts import EvaluatedModel, StudyArtefacts, Trial
+from vehest.report.document import write_document
+from vehest.studies.artefacts import EvaluatedModel, Trial
 from vehest.training.through_filter import Drive
 from vehest_papers.kit.block_errors import BlockErrors, Key, blocks_of, read_training
 from vehest_papers.kit.block_rows import BlockRow, checked_training
@@ -252,14 +260,12 @@ def test_candidates_keep_their_names_and_studies_without_test_sets_are_refused(p
     assert "seed1 has no mae_weighted.tyre_a; evaluate it again" in refusal(
         lambda: runs_of(replace(part, metrics=metrics))
     )
-    assert "needs the part 'real'" in refusal(
-        lambda: documents(StudyArtefacts("s", "t", "a", "c", {}, {}, []))
-    )
+    assert "needs the part 'real'" in refusal(lambda: documents(study_of("s")))
     wet_part = replace(
         part, split=Split("s", SPLIT.train, SPLIT.validation, {"wet": SPLIT.tests["tyre_a"]})
     )
     assert "must be called tyre_a and tyre_d" in refusal(
-        lambda: documents(StudyArtefacts("s", "t", "a", "c", {}, {"real": wet_part}, []))
+        lambda: documents(study_of("s", {"real": wet_part}))
     )
 
 
@@ -281,29 +287,25 @@ def test_report_has_every_table_and_figure_of_the_paper_and_names_its_data(
     untrained = {"one_step": {**PHASE, "max_epochs": 0}}
     parts |= {"scratch": only(part, "NNTF_UH", untrained), "diagonal": only(part, "NNTF_UH")}
     remark = "part 'real' does not use what the search 'trial_gru' chose"
-    artefacts = StudyArtefacts(
+    artefacts = study_of(
         "learned_ukf",
-        "t",
-        "a",
-        "c",
-        titles,
         parts,
-        ["curvature"],
+        titles=titles,
+        absent=["curvature"],
         trials=gru_trials(),
         search_remarks=[remark],
     )
     document = documents(artefacts)["report"]
     write_document(document, tmp_path, page=False)
     text = (tmp_path / "report.md").read_text()
-    figures = {block.name for block in document.blocks if isinstance(block, Figure)}
-    assert figures == {
+    assert figures_of(document).keys() == {
         *(f"figure_{number}_real" for number in (3, 4, 5, 6)),
         "figure_7",
         "friction_real",
         "loss_curves",
     }
-    names = {block.name for block in document.blocks if isinstance(block, Table)}
-    assert names >= {
+    tables = tables_of(document)
+    assert tables.keys() >= {
         "decided_claims",
         "overview",
         *(f"{name}_real" for name in ("consistency", "friction", "start", "coverage")),
@@ -313,11 +315,7 @@ def test_report_has_every_table_and_figure_of_the_paper_and_names_its_data(
     files |= {f"{name}_real" for name in ("table_1", "table_2", "by_state", "budget")}
     assert set(document.data) >= files
     claims = document.data["claims"].set_index("id")
-    decided = next(
-        block
-        for block in document.blocks
-        if isinstance(block, Table) and block.name == "decided_claims"
-    ).frame
+    decided = tables["decided_claims"]
     assert set(decided["verdict"]) <= set(DECIDED)
     assert len(decided) == claims["verdict"].isin(DECIDED).sum()
     content = claims_of("learned_ukf")
@@ -335,15 +333,10 @@ def test_report_has_every_table_and_figure_of_the_paper_and_names_its_data(
         assert claims.loc[measured, "verdict"] != "not assessed"
     assert claims.loc["nntf_below_pc_tyre_a", "verdict"] == "not assessed"
     assert "no per-block errors of PC" in claims.loc["nntf_below_pc_tyre_a", "why"]
-    first_300 = " ".join(text.split()[:300])
-    for word in ("**Question.**", "**Answer.**", "**Evidence.**", "**Recommendation.**"):
-        assert word in first_300
-    assert "| the authors' public code, NNTF_UH | 0.0158 | 0.0441 | 1 |" in first_300
-    assert "Not complete" not in text
-    assert len(text.split()) <= 3000
     template = (Path(documents.__code__.co_filename).parent / "report.md.j2").read_text()
-    assert len(template.split()) <= 3000
-    assert "{% if" not in template
+    row = "| the authors' public code, NNTF_UH | 0.0158 | 0.0441 | 1 |"
+    assert row in first_screen(text, template)
+    assert "Not complete" not in text
     assert set(document.data) >= {
         f"{name}_real" for name in ("slip_density", "traces", "figure_5", "figure_6")
     }
@@ -599,6 +592,12 @@ def test_validation_from_scratch_is_compared_with_the_worst_pre_trained_seed():
     np.testing.assert_allclose(values[0], 2.0 + np.array([6.0 - 4.0, 6.0 - 8.0]) / 3.0)
 
 
+def report_text(artefacts, folder):
+    """Markdown of the study's report, in one line, which is written with its tables."""
+    write_document(documents(artefacts)["report"], folder, page=False)
+    return " ".join((folder / "report.md").read_text().split())
+
+
 def test_report_counts_the_seeds_of_a_candidate_beside_the_main_part(part, tmp_path, monkeypatch):
     undrawn(monkeypatch)
     parts = {
@@ -606,10 +605,7 @@ def test_report_counts_the_seeds_of_a_candidate_beside_the_main_part(part, tmp_p
         "scratch": only(part, "NNTF_UH", {"one_step": {**PHASE, "max_epochs": 0}}),
     }
     not_trained = {"scratch": ["learned_ukf-nntf_uh-seed2"]}
-    titles = dict.fromkeys(parts, "T")
-    artefacts = StudyArtefacts("learned_ukf", "t", "a", "c", titles, parts, not_trained=not_trained)
-    write_document(documents(artefacts)["report"], tmp_path, page=False)
-    text = " ".join((tmp_path / "report.md").read_text().split())
+    text = report_text(study_of("learned_ukf", parts, not_trained=not_trained), tmp_path)
     assert "where fewer than planned: NNTF_UH from scratch 2 of 3." in text
 
 
@@ -625,27 +621,16 @@ def test_report_is_drawn_with_a_single_candidate(part, tmp_path, monkeypatch):
         "length_250": ["learned_ukf-nntf_u-seed0"],
         "doubled": ["learned_ukf-pc-seed0"],
     }
+    parts = {"real": only(part, "GRU")}
     titles = dict.fromkeys(not_trained, "T")
-    artefacts = StudyArtefacts(
-        "learned_ukf",
-        "t",
-        "a",
-        "c",
-        titles,
-        {"real": only(part, "GRU")},
-        not_trained=not_trained,
-    )
-    document = documents(artefacts)["report"]
-    write_document(document, tmp_path, page=False)
-    text = (tmp_path / "report.md").read_text()
-    report_text = " ".join(text.split())
-    assert "**Not complete:** 6 planned trainings are not done." in report_text
-    assert "where fewer than planned: GRU 2 of 3." in report_text
+    artefacts = study_of("learned_ukf", parts, titles=titles, not_trained=not_trained)
+    text = report_text(artefacts, tmp_path)
+    assert "**Not complete:** 6 planned trainings are not done." in text
+    assert "where fewer than planned: GRU 2 of 3." in text
     assert (
-        "not assessed: NNTF_UH; NNTF_U; NNTF_UH from scratch; NNTF_U, 250 steps, constant"
-        in report_text
+        "not assessed: NNTF_UH; NNTF_U; NNTF_UH from scratch; NNTF_U, 250 steps, constant" in text
     )
-    assert "3 parts of the pipeline have no training." in report_text
+    assert "3 parts of the pipeline have no training." in text
     claims = pd.read_csv(tmp_path / "tables" / "claims.csv").set_index("id")
     assert set(claims["verdict"]) == {"not assessed", "not testable"}
     assert claims.loc["nntf_uh_below_gru_tyre_a", "why"] == "NNTF_UH is not trained"

@@ -11,13 +11,14 @@ import numpy as np
 import pandas as pd
 import pytest
 import yaml
+from study_parts import figures_of, study_of, tables_of, text_of
 from test_cli import _statuses
 
 from conftest import planar_drive
 from place import DATASET
 from vehest.data.store import write_recording
 from vehest.simulation.plant.parameters import Vehicle
-from vehest.studies.artefacts import AbsentDataset, StoredDataset, StudyArtefacts
+from vehest.studies.artefacts import AbsentDataset, StoredDataset
 from vehest_papers.proving_ground import documents, gates
 from vehest_papers.proving_ground.document import TEMPLATE
 from vehest_papers.proving_ground.drawing import Distribution, share_beyond
@@ -57,7 +58,7 @@ def _drive(name="f1_001", seed=0, seconds=60.0, rate_hz=20.0, *, steered=0.0):
 
 def _with(recording, **channels):
     """The recording with some channels replaced."""
-    return replace(recording, channels={**recording.channels, **channels})
+    return recording.with_channels(channels)
 
 
 def _tally(*drives):
@@ -105,27 +106,13 @@ def study(tmp_path_factory):
         _stored(folder, "sim_two_cars", "simulated", simulated),
         _stored(folder, "ferrari_250lm", "real", [real]),
     ]
-    return StudyArtefacts(
-        "proving_ground",
-        "Proving ground",
-        "About it.",
-        "vehest run pipelines/x.yaml",
-        datasets=datasets,
-    )
+    study = study_of("proving_ground", datasets=datasets)
+    return replace(study, command="vehest run pipelines/x.yaml")
 
 
 @pytest.fixture(scope="module")
 def report(study):
     return documents(study)["report"]
-
-
-def _text(report):
-    blocks = [block for block in report.blocks if isinstance(block, str)]
-    return " ".join("\n".join(blocks).split())
-
-
-def _tables(report):
-    return {block.name: block.frame for block in report.blocks if hasattr(block, "frame")}
 
 
 def test_statistics_of_many_recordings_are_those_of_all_samples_together():
@@ -245,10 +232,12 @@ def test_accidents_are_flagged_and_counted(study, report):
     assert {name: segment.recording for name, segment in vehicle.segments.items()} == {
         "laps": "f1_001"
     }, "traces show a drive that went as planned"
-    assert "Of 3 simulated drives 2 went wrong by accident: 1 spun, 1 left the road" in _text(
+    assert "Of 3 simulated drives 2 went wrong by accident: 1 spun, 1 left the road" in text_of(
         report
     )
-    assert _tables(report)["flagged"]["largest_sideslip"].iloc[0] == pytest.approx(np.degrees(2.0))
+    assert tables_of(report)["flagged"]["largest_sideslip"].iloc[0] == pytest.approx(
+        np.degrees(2.0)
+    )
     statistics = report.data["statistics"]
     spun = statistics[(statistics["quantity"] == "spun") & (statistics["set"] == "f1")]
     assert spun["value"].tolist() == [1]
@@ -258,10 +247,10 @@ def test_accidents_are_flagged_and_counted(study, report):
 
 
 def test_report_states_data_ratios_and_the_papers_figures(study, report):
-    text = _text(report)
+    text = text_of(report)
     assert "seed 7" in text
     assert "vehest run pipelines/x.yaml" in text
-    tables = _tables(report)
+    tables = tables_of(report)
     beside_papers = report.data["beside_papers"]
     assert set(beside_papers["set"]) == {"F-1", "F-2"}
     assert "| quantity | F-1 | F-2 | | :-- | --: | --: |" in text
@@ -275,7 +264,7 @@ def test_report_states_data_ratios_and_the_papers_figures(study, report):
     real = tables["beside_real"].set_index("quantity")
     assert real.loc["duration", "real"] == pytest.approx(80.0)
     assert real.loc["duration", "simulated"] == pytest.approx(210.0)
-    figures = [block for block in report.blocks if hasattr(block, "static")]
+    figures = figures_of(report).values()
     assert len(figures) == 3
     assert all("SIMULATED" in figure.caption for figure in figures)
 
@@ -289,11 +278,11 @@ def test_report_template_is_short_and_begins_with_its_answer():
 def test_without_the_real_recording_the_report_says_how_to_get_it(study):
     artefacts = replace(study, datasets=study.datasets[:1], absent_datasets=[REAL])
     report = documents(artefacts)["report"]
-    text = _text(report)
+    text = text_of(report)
     assert "absent from this report" in text
     assert "somebody's licence" in text
     assert "vehest data check ferrari_250lm" in text
-    assert "beside_real" not in _tables(report)
+    assert "beside_real" not in tables_of(report)
 
 
 @pytest.fixture

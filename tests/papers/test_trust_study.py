@@ -55,10 +55,10 @@ def alarmed(*edges):
     return np.searchsorted(edges, np.arange(36_000), side="right") % 2 == 1
 
 
-def scores(manoeuvres, common_share, seed, samples=40):
+def scores(manoeuvres, common_share, seed):
     """Sizes of Gaussian errors, of which a share of the variance is one number a manoeuvre."""
     generator = np.random.default_rng(seed)
-    labels = np.repeat(np.arange(manoeuvres), samples)
+    labels = np.repeat(np.arange(manoeuvres), 40)
     common = generator.standard_normal(manoeuvres)[labels]
     errors = np.sqrt(common_share) * common + np.sqrt(
         1.0 - common_share

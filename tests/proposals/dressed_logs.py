@@ -67,9 +67,9 @@ def f1tenth(data, run, rate_hz=100.0):
     }
 
 
-def later(t, samples, delay):
-    """What a sensor shows that is late [s]."""
-    return np.interp(t - delay, t, samples)
+def later(d, name, delay):
+    """What a sensor shows of a drive that is late [s]."""
+    return np.interp(d["t"] - delay, d["t"], d[name])
 
 
 def nuisances(t, seed):
@@ -194,7 +194,7 @@ def sideslip(data, folder):
     )
     write(
         folder / "sideslip.csv",
-        table(d, columns, unix=UNIX + d["t"], late=np.degrees(later(d["t"], d["r"], 0.1))),
+        table(d, columns, unix=UNIX + d["t"], late=np.degrees(later(d, "r", 0.1))),
     )
 
 
@@ -354,7 +354,7 @@ def two_runs(data, folder):
     )
     for number, run in ((1, 2), (2, 5)):
         d = f1tenth(data, run, 200.0)
-        write(folder / f"run_{number}.csv", table(d, columns, late=later(d["t"], d["ay"], 0.08)), 5)
+        write(folder / f"run_{number}.csv", table(d, columns, late=later(d, "ay", 0.08)), 5)
 
 
 def no_reference(data, folder):

@@ -5,6 +5,8 @@ from functools import lru_cache
 import numpy as np
 import pandas as pd
 
+from vehest.run.own_car.inspect import inspect
+
 G = 9.80665
 WHEELBASE = 2.7
 RATIO = 15.0
@@ -87,3 +89,13 @@ def write(file, table, **options):
         rows = map(",".join, zip(*columns, strict=True))
         file.write_text("\n".join([table.iloc[:0].to_csv(index=False).rstrip("\n"), *rows, ""]))
     return file
+
+
+def inspected(*files, vehicle=None):
+    """What `vehest new my_car` finds in files."""
+    return inspect("my_car", files, vehicle)
+
+
+def examine(folder, table, **options):
+    """What it finds in the file of a table."""
+    return inspected(write(folder / "lap.csv", table, **options))

@@ -14,7 +14,7 @@ import yaml
 from dressed_logs import LOGS, write_log
 from mdf_log import write_mdf
 from own_car_proposals import ANSWERS, outcome_of, rows_of
-from planted_logs import RADIUS, G, drive, usual, write
+from planted_logs import RADIUS, G, drive, examine, inspected, usual, write
 from vbo_log import clock
 
 from vehest.alignment.proposals.names import hints
@@ -23,7 +23,7 @@ from vehest.data.errors import ConfigurationError, DataError, MissingError, Vehe
 from vehest.data.transforms import Resample
 from vehest.data.units import factor_to_si
 from vehest.run.own_car.dataset import draft, is_certain
-from vehest.run.own_car.inspect import busiest_rows, inspect
+from vehest.run.own_car.inspect import busiest_rows
 from vehest.run.own_car.questions import ask, questions_of
 from vehest.run.own_car.write import write as write_files
 from vehest.sources.base import open_source
@@ -34,8 +34,16 @@ from vehest.sources.surveys.tables import unit_in_name
 EXAMPLE_LOG = Path(__file__).parents[2] / "docs" / "examples" / "lap.csv"
 
 
-def examine(tmp_path, table, **options):
-    return inspect("my_car", [write(tmp_path / "lap.csv", table, **options)])
+@pytest.fixture
+def d():
+    """Motion of a known car: name -> (T,), in SI units."""
+    return drive()
+
+
+@pytest.fixture
+def table(d):
+    """Its log under usual names and units."""
+    return usual(d)
 
 
 def proposals_of(tmp_path, table):
@@ -89,11 +97,10 @@ def places_of(d, turning=1.0):
 def inspect_course(tmp_path, table):
     """With all digits of its degrees."""
     table.to_csv(tmp_path / "course.csv", index=False)
-    return inspect("my_car", [tmp_path / "course.csv"]).proposals
+    return inspected(tmp_path / "course.csv").proposals
 
 
-def test_units_and_signs_of_a_usual_log_are_found_without_any_in_its_header(tmp_path):
-    table = usual(drive())
+def test_units_and_signs_of_a_usual_log_are_found_without_any_in_its_header(tmp_path, table):
     table["Gyro"] *= -1.0
     by_channel = proposed(tmp_path, table)
     units = {
@@ -118,8 +125,7 @@ def test_units_and_signs_of_a_usual_log_are_found_without_any_in_its_header(tmp_
     ("unit", "of_rate", "of_ay"),
     [("m/s", "rad/s", "g"), ("km/h", "deg/s", "m/s²"), ("mph", "rad/s", "m/s²")],
 )
-def test_units_are_distinguished_under_names_that_say_nothing(tmp_path, unit, of_rate, of_ay):
-    d = drive()
+def test_units_are_distinguished_under_names_that_say_nothing(tmp_path, unit, of_rate, of_ay, d):
     size = {
         "m/s": 1.0,
         "km/h": 3.6,
@@ -165,9 +171,9 @@ def test_which_way_is_left_is_asked_unless_wheels_of_both_sides_or_a_course_tell
     ("vertical", "of_ay", "signs"), [(-1.0, 1, [-1, -1]), (1.0, 1, [1, 1]), (-1.0, -1, [1, -1])]
 )
 def test_gravity_in_a_z_axis_that_points_down_proposes_which_way_is_left(
-    tmp_path, vertical, of_ay, signs
+    tmp_path, vertical, of_ay, signs, table
 ):
-    table = usual(drive()).drop(columns=["Steer", "Beta"])
+    table = table.drop(columns=["Steer", "Beta"])
     table["AccZ"] = vertical + 0.02 * np.sin(np.arange(len(table)) / 7.0)
     table["LatAcc"] *= of_ay
     examined = examine(tmp_path, table)
@@ -185,8 +191,7 @@ def test_an_accelerometer_that_is_turned_by_15_degrees_is_remarked(tmp_path):
     assert re.search(r"about 1[456] deg about the vertical.*mounting_correction", remark)
 
 
-def test_wheels_alone_give_a_speed_and_their_radius_unless_they_miss_samples(tmp_path):
-    d = drive()
+def test_wheels_alone_give_a_speed_and_their_radius_unless_they_miss_samples(tmp_path, d):
     wheels = wheels_of(d, "n_{}", 30.0 / np.pi)
     examined = examine(tmp_path, usual(d).drop(columns="Speed").assign(**wheels))
     assert examined.proposals.by_channel["wheel_speed_fl"].unit == "rpm"
@@ -271,9 +276,8 @@ def test_wheel_speeds_in_counts_of_no_known_unit_are_left_out_with_a_question(tm
     [("n_VL", "OilTemp"), ("n_VL", "pose_yaw [rad]"), ("n_VL [mph]", "pose_yaw")],
 )
 def test_wheels_without_speed_and_acceleration_are_proposed_and_their_mean_is_not(
-    tmp_path, wheel, other_column
+    tmp_path, wheel, other_column, d
 ):
-    d = drive()
     columns = {
         "t": d["t"],
         wheel: d["wheel_fl"],
@@ -300,15 +304,12 @@ def test_road_and_steering_wheel_are_distinguished_and_their_ratio_estimated(
     )
     assert not any("from slow corners" in text for text in handwheel.evidence)
     file = write(tmp_path / "lap.csv", table)
-    assert draft(inspect("my_car", [file])).ratio is None
-    ratio = draft(inspect("my_car", [file], {"wheelbase": 2.7})).ratio
+    assert draft(inspected(file)).ratio is None
+    ratio = draft(inspected(file, vehicle={"wheelbase": 2.7})).ratio
     assert abs(ratio[0] - 15.0) < max(3.0 * ratio[1], 1.0)
 
 
-def test_ambiguous_speeds_are_questions_and_the_speed_of_the_bus_is_the_cars(
-    tmp_path,
-):
-    d = drive()
+def test_ambiguous_speeds_are_questions_and_the_speed_of_the_bus_is_the_cars(tmp_path, d):
     assert {"Speed", "Speed2"} <= set(asked(tmp_path, usual(d).assign(Speed2=3.6 * d["vx"] + 0.01)))
     noise = 0.1 * np.random.default_rng(1).standard_normal(len(d["t"]))
     of_bus = (
@@ -336,7 +337,7 @@ def test_ambiguous_speeds_are_questions_and_the_speed_of_the_bus_is_the_cars(
 def test_no_wheelbase_is_stated_where_the_halves_of_the_drive_contradict_each_other(data_root, log):
     """A Golf of 2.578 m in a lane change and a ramp steer, which regressions made 0.6 m."""
     file = data_root / "liu_golf" / f"{log}.csv"
-    steer = inspect("my_car", [file]).proposals.by_channel["steer"]
+    steer = inspected(file).proposals.by_channel["steer"]
     assert not any("wheelbase" in text for text in steer.evidence)
 
 
@@ -368,9 +369,9 @@ def test_columns_of_noise_do_not_hide_the_car(tmp_path, columns):
 
 
 @pytest.mark.parametrize("mark", ["", "---", "n.a."])
-def test_slow_signals_with_empty_cells_and_marks_of_missing_samples_are_bridged(tmp_path, mark):
-    d = drive()
-    table = usual(d)
+def test_slow_signals_with_empty_cells_and_marks_of_missing_samples_are_bridged(
+    tmp_path, mark, d, table
+):
     table.loc[1000:1010, "LatAcc"] = np.nan
     table.loc[np.arange(len(table)) % 5 != 0, "Beta"] = np.nan
     log_draft = drafted(tmp_path, table, na_rep=mark)
@@ -381,11 +382,11 @@ def test_slow_signals_with_empty_cells_and_marks_of_missing_samples_are_bridged(
 
 
 def test_a_log_without_reference_ranks_nothing_and_one_the_other_way_round_keeps_signs_together(
-    tmp_path,
+    tmp_path, table
 ):
-    table = usual(drive()).drop(columns="Beta")
-    examined = inspect(
-        "my_car", [write(tmp_path / "lap 1.csv", table.assign(LatAccRear=table["LatAcc"] + 0.01))]
+    table = table.drop(columns="Beta")
+    examined = inspected(
+        write(tmp_path / "lap 1.csv", table.assign(LatAccRear=table["LatAcc"] + 0.01))
     )
     assert any(
         "correlation 1.000, measured at another point" in text
@@ -446,7 +447,7 @@ def test_what_is_no_log_is_one_line(tmp_path, name, content, message_part):
     pytest.importorskip("rosbags", reason="the extra ros is not installed")
     (tmp_path / name).write_bytes(content)
     with pytest.raises((DataError, MissingError) if message_part else VehestError) as refusal:
-        inspect("my_car", [tmp_path / name])
+        inspected(tmp_path / name)
     message = str(refusal.value)
     assert (message_part in message, "\n" in message, name in message) == (True, False, True)
 
@@ -474,9 +475,7 @@ def test_a_row_of_units_a_preamble_and_quotes_are_seen_through(tmp_path):
         "Gyro Yaw": "deg/s",
         "G Lat": "m/s^2",
     }
-    np.testing.assert_allclose(
-        read_back(draft(inspect("my_car", [file])))["vx"], d["vx"], atol=1e-4
-    )
+    np.testing.assert_allclose(read_back(draft(inspected(file)))["vx"], d["vx"], atol=1e-4)
 
 
 ROLES = {
@@ -533,10 +532,8 @@ def test_dressed_logs_of_real_cars_are_seen_through(tmp_path, data_root, log):
 
 
 def test_steering_is_no_lateral_acceleration_and_contradicted_names_are_asked_about(
-    tmp_path,
+    tmp_path, d, table
 ):
-    d = drive()
-    table = usual(d)
     agreeing = table.drop(columns="LatAcc").assign(Steer=d["ay"] / 9.80665 + 0.02 * np.sin(d["t"]))
     assert "ay" not in proposed(tmp_path, agreeing)
     assert "yaw_rate" not in proposed(tmp_path, table.drop(columns="Gyro"))
@@ -577,14 +574,11 @@ def test_times_of_a_clock_are_read(tmp_path, first, time_format):
     words = [
         stamp.strftime(time_format)[:-3] + ("Z" if "T" in time_format else "") for stamp in stamps
     ]
-    examined = inspect(
-        "my_car",
-        [
-            write(
-                tmp_path / "lap.csv",
-                usual(d).rename(columns={"Time [s]": "Time"}).assign(Time=words),
-            )
-        ],
+    examined = inspected(
+        write(
+            tmp_path / "lap.csv",
+            usual(d).rename(columns={"Time [s]": "Time"}).assign(Time=words),
+        )
     )
     assert examined.rate_hz is None
     recording = read_back(draft(examined))
@@ -593,9 +587,9 @@ def test_times_of_a_clock_are_read(tmp_path, first, time_format):
 
 
 def test_whole_nanoseconds_and_dates_are_a_clock_and_a_column_that_counts_runs_makes_recordings(
-    tmp_path,
+    tmp_path, table
 ):
-    table = usual(drive()).rename(columns={"Time [s]": "stamp"})
+    table = table.rename(columns={"Time [s]": "stamp"})
     table["stamp"] = 1_700_000_000_000_000_000 + (table["stamp"] * 1e9).round().astype("int64")
     clock = survey(write(tmp_path / "lap.csv", table)).clock
     assert (clock.column, clock.unit) == ("stamp", "ns")
@@ -612,7 +606,7 @@ def test_whole_nanoseconds_and_dates_are_a_clock_and_a_column_that_counts_runs_m
     d = drive(60.0)
     dates = pd.Timestamp("2024-05-03T10:59:30") + pd.to_timedelta(d["t"], unit="s").round("ms")
     usual(d).assign(**{"Time [s]": dates}).to_parquet(tmp_path / "lap.parquet")
-    examined = inspect("my_car", [tmp_path / "lap.parquet"])
+    examined = inspected(tmp_path / "lap.parquet")
     assert (examined.rate_hz, examined.log.clock.unit) == (None, "ns")
     recording = read_back(draft(examined))
     assert recording.rate_hz == pytest.approx(50.0)
@@ -658,20 +652,16 @@ def written(file, table):
 
 
 @pytest.mark.parametrize("suffix", [".vbo", ".mf4", ".csv"])
-def test_a_pause_ends_a_recording_and_no_line_crosses_it(tmp_path, suffix):
-    table = usual(drive())
+def test_a_pause_ends_a_recording_and_no_line_crosses_it(tmp_path, suffix, table):
     if suffix == ".csv":
         table = table.rename(columns={"Speed": "Tempo"})
         table.loc[np.arange(len(table)) % 5 != 0, "Beta"] = np.nan
     log_draft = draft(
-        inspect(
-            "my_car",
-            [
-                written(
-                    tmp_path / f"lap{suffix}",
-                    table[(table["Time [s]"] < 50.0) | (table["Time [s]"] >= 53.0)],
-                )
-            ],
+        inspected(
+            written(
+                tmp_path / f"lap{suffix}",
+                table[(table["Time [s]"] < 50.0) | (table["Time [s]"] >= 53.0)],
+            )
         )
     )
     assert (
@@ -689,23 +679,21 @@ def test_a_pause_ends_a_recording_and_no_line_crosses_it(tmp_path, suffix):
     assert any("split into 2 recordings" in note for note in log_draft.notes)
 
 
-def test_samples_that_a_measurement_misses_for_half_a_second_are_bridged(tmp_path):
-    table = usual(drive())
+def test_samples_that_a_measurement_misses_for_half_a_second_are_bridged(tmp_path, table):
     table.loc[1000:1025, "Steer"] = np.nan
-    log_draft = draft(inspect("my_car", [written(tmp_path / "lap.mf4", table)]))
+    log_draft = draft(inspected(written(tmp_path / "lap.mf4", table)))
     assert log_draft.dataset["channels"]["handwheel"]["max_gap"] == pytest.approx(0.54)
     steer = read_back(log_draft)["handwheel"][1000:1026]
     np.testing.assert_allclose(np.diff(steer, 2), 0.0, atol=1e-9)
 
 
 def test_missing_samples_of_a_vbox_are_bridged_for_up_to_a_second_and_end_a_recording_beyond(
-    tmp_path,
+    tmp_path, table
 ):
-    table = usual(drive())
     table.loc[1000:1025, "Steer"] = np.nan
     table.loc[3000:3009, "Gyro"] = 327.67  # a code of loggers
     table.loc[4000:4100, "Gyro"] = np.nan
-    log_draft = draft(inspect("my_car", [written(tmp_path / "lap.vbo", table)]))
+    log_draft = draft(inspected(written(tmp_path / "lap.vbo", table)))
     assert log_draft.dataset["max_gap"] == 1.0
     assert [round(seconds) for seconds in log_draft.durations.values()] == [80, 38]
     recording = open_source(log_draft.dataset).read("lap_run_0")
@@ -714,14 +702,11 @@ def test_missing_samples_of_a_vbox_are_bridged_for_up_to_a_second_and_end_a_reco
 
 
 def test_a_channel_with_gaps_that_nothing_bridges_is_left_out_so_that_the_others_can_be_resampled(
-    tmp_path,
+    tmp_path, table
 ):
     """Two seconds in a table without times."""
-    table = usual(drive())
     table.loc[1000:1100, "Steer"] = np.nan
-    log_draft = draft(
-        inspect("my_car", [written(tmp_path / "lap.csv", table.drop(columns="Time [s]"))])
-    )
+    log_draft = draft(inspected(written(tmp_path / "lap.csv", table.drop(columns="Time [s]"))))
     assert any(
         note.startswith("'Steer' (handwheel) is left out: it has missing samples")
         for note in log_draft.notes
@@ -736,13 +721,14 @@ def test_a_channel_with_gaps_that_nothing_bridges_is_left_out_so_that_the_others
     }
 
 
-def test_a_measurement_whose_reference_is_invalid_for_long_makes_recordings_of_the_rest(tmp_path):
-    table = usual(drive())
+def test_a_measurement_whose_reference_is_invalid_for_long_makes_recordings_of_the_rest(
+    tmp_path, table
+):
     table.loc[
         (table["Time [s]"] < 20.0) | ((table["Time [s]"] > 70.0) & (table["Time [s]"] < 75.0)),
         "Beta",
     ] = np.nan
-    log_draft = draft(inspect("my_car", [written(tmp_path / "lap.mf4", table)]))
+    log_draft = draft(inspected(written(tmp_path / "lap.mf4", table)))
     assert (
         "vy_ref" in log_draft.channels,
         [round(duration) for duration in log_draft.durations.values()],
@@ -807,7 +793,7 @@ def in_two_files(tmp_path, change, **options):
         write(tmp_path / "lap_1.csv", usual(drive(seed=1))),
         write(tmp_path / "lap_2.csv", change(second), **options),
     ]
-    return inspect("my_car", files)
+    return inspected(*files)
 
 
 def test_a_second_file_in_another_unit_is_told_of_and_what_is_empty_or_impossible_in_it_left_out(
@@ -838,8 +824,7 @@ def test_a_second_file_in_another_unit_is_told_of_and_what_is_empty_or_impossibl
         usual(drive(100.0, seed=2)).assign(**{"roll (rad)": 40.0 * roll[:5000]}),
     )
     assert [
-        "roll" in inspect("my_car", files).proposals.by_channel
-        for files in ([first], [first, second])
+        "roll" in inspected(*files).proposals.by_channel for files in ([first], [first, second])
     ] == [True, False]
 
 
@@ -863,7 +848,7 @@ def test_files_that_are_laid_out_otherwise_or_of_two_loggers_are_refused(tmp_pat
         DataError,
         match=r"lap_2.csv' has 'Speed' in 'm/s', .*lap_1.csv' in 'km/h'; use the same unit in both",
     ):
-        inspect("my_car", [tmp_path / "lap_1.csv", tmp_path / "lap_2.csv"])
+        inspected(tmp_path / "lap_1.csv", tmp_path / "lap_2.csv")
     write(tmp_path / "lap_1.csv", usual(drive(90.0)))
     write(
         tmp_path / "lap_2.csv",
@@ -872,7 +857,7 @@ def test_files_that_are_laid_out_otherwise_or_of_two_loggers_are_refused(tmp_pat
     with pytest.raises(
         DataError, match=r"lap_1\.csv' has none of the columns that are channels in '.*lap_2\.csv'"
     ):
-        inspect("my_car", [tmp_path / "lap_1.csv", tmp_path / "lap_2.csv"])
+        inspected(tmp_path / "lap_1.csv", tmp_path / "lap_2.csv")
 
 
 def test_an_acceleration_that_is_the_difference_of_the_references_speed_is_not_the_cars(tmp_path):
@@ -900,10 +885,7 @@ def test_an_acceleration_that_is_the_difference_of_the_references_speed_is_not_t
     )
 
 
-def test_a_torque_is_no_acceleration_and_a_derived_yaw_rate_is_the_references(
-    tmp_path,
-):
-    d = drive()
+def test_a_torque_is_no_acceleration_and_a_derived_yaw_rate_is_the_references(tmp_path, d):
     table = pd.DataFrame(
         {
             "t": d["t"],
@@ -927,11 +909,10 @@ def test_a_torque_is_no_acceleration_and_a_derived_yaw_rate_is_the_references(
 
 
 def test_a_sign_that_the_motion_does_not_decide_is_asked_and_taken_as_most_of_the_others_count(
-    tmp_path,
+    tmp_path, d, table
 ):
     """Hardly any sideslip; the wheels tell which way is left."""
-    d = drive()
-    table = usual(d).rename(columns={"Beta": "Beta [deg]"}) * np.array(
+    table = table.rename(columns={"Beta": "Beta [deg]"}) * np.array(
         [1.0, 1.0, -1.0, 1.0, 1.0, 1.0, 1.0]
     )
     table["Beta [deg]"] = 0.01 * np.random.default_rng(3).standard_normal(len(table))
@@ -948,20 +929,20 @@ def test_a_sign_that_the_motion_does_not_decide_is_asked_and_taken_as_most_of_th
 
 
 def test_rows_without_a_sample_for_longer_than_lines_bridge_are_left_out_and_end_a_recording(
-    tmp_path,
+    tmp_path, table
 ):
     """Satellites that come late and are lost once.
 
     Every other cell of a slow signal is bridged, in Parquet, too.
     """
-    table = usual(drive()).astype(float)
+    table = table.astype(float)
     lost = (table["Time [s]"] < 10.0) | ((table["Time [s]"] > 50.0) & (table["Time [s]"] < 53.0))
     table.loc[lost, "Beta"] = np.nan
     table.loc[::2, "LongAcc"] = np.nan
     table.to_parquet(tmp_path / "lap.parquet")
     for log_draft in (
         drafted(tmp_path, table),
-        draft(inspect("other", [tmp_path / "lap.parquet"])),
+        draft(inspected(tmp_path / "lap.parquet")),
     ):
         assert log_draft.dataset["drop_rows"] == {"lap": ["1-500", "2502-2650"]}
         assert (
@@ -975,9 +956,8 @@ def test_rows_without_a_sample_for_longer_than_lines_bridge_are_left_out_and_end
 
 
 def test_course_and_heading_without_another_reference_and_samples_that_rows_repeat_are_told_of(
-    tmp_path,
+    tmp_path, d
 ):
-    d = drive()
     yaw = np.cumsum(d["r"]) / 50.0
     table = (
         usual(d)
@@ -999,12 +979,10 @@ def test_course_and_heading_without_another_reference_and_samples_that_rows_repe
 
 @pytest.mark.parametrize("suffix", [".csv", ".vbo", ".mf4"])
 def test_a_few_samples_that_no_vehicle_drives_are_bridged_and_said_in_every_format(
-    tmp_path, suffix
+    tmp_path, suffix, d, table
 ):
-    d = drive()
-    table = usual(d)
     table.loc[[2000, 2001], "Speed"] = 8123.0  # no number that loggers write for nothing
-    log_draft = draft(inspect("my_car", [written(tmp_path / f"lap{suffix}", table)]))
+    log_draft = draft(inspected(written(tmp_path / f"lap{suffix}", table)))
     assert log_draft.dataset["transforms"][0]["name"] == "bridge_impossible"
     assert any("bridge_impossible" in note for note in log_draft.notes)
     recording = read_back(log_draft)
@@ -1013,9 +991,8 @@ def test_a_few_samples_that_no_vehicle_drives_are_bridged_and_said_in_every_form
 
 
 @pytest.mark.parametrize("excess", [1.0, 1.05])
-def test_a_speedometer_that_reads_too_much_is_asked_where_wheels_agree(tmp_path, excess):
-    d = drive()
-    table = usual(d).assign(Speed=3.6 * excess * d["vx"])
+def test_a_speedometer_that_reads_too_much_is_asked_where_wheels_agree(tmp_path, excess, d, table):
+    table = table.assign(Speed=3.6 * excess * d["vx"])
     by_channel = proposed(
         tmp_path,
         table.assign(**wheels_of(d, "WheelSpeed{}", 3.6 * RADIUS)),
@@ -1040,15 +1017,14 @@ def test_a_speedometer_that_reads_too_much_is_asked_where_wheels_agree(tmp_path,
 
 @pytest.mark.parametrize("suffix", [".csv", ".vbo", ".mf4"])
 def test_a_unit_in_the_header_that_the_motion_contradicts_is_asked_and_the_motions_is_read(
-    tmp_path, suffix
+    tmp_path, suffix, d, table
 ):
-    d = drive()
-    table = usual(d).assign(Gyro=d["r"])
+    table = table.assign(Gyro=d["r"])
     if suffix == ".csv":
         table = table.rename(
             columns={"Speed": "Speed [km/h]", "Gyro": "Gyro [deg/s]", "LatAcc": "LatAcc [g]"}
         )
-    examined = inspect("my_car", [written(tmp_path / f"lap{suffix}", table)])
+    examined = inspected(written(tmp_path / f"lap{suffix}", table))
     by_channel = examined.proposals.by_channel
     assert (by_channel["yaw_rate"].unit, by_channel["vx"].unit, by_channel["ay"].unit) == (
         "rad/s",
@@ -1065,8 +1041,7 @@ def test_a_unit_in_the_header_that_the_motion_contradicts_is_asked_and_the_motio
     )
 
 
-def test_a_yaw_rate_a_hundred_times_too_large_is_left_out_and_its_factor_is_offered(tmp_path):
-    d = drive()
+def test_a_yaw_rate_a_hundred_times_too_large_is_left_out_and_its_factor_is_offered(tmp_path, d):
     table = pd.DataFrame(
         {
             "t [s]": d["t"],
@@ -1134,9 +1109,8 @@ def test_a_wrong_factor_is_found_by_a_second_relation_and_its_column_alone_is_le
     ],
 )
 def test_a_unit_that_two_relations_contradict_is_corrected_with_both_named(
-    tmp_path, factors, units
+    tmp_path, factors, units, d
 ):
-    d = drive()
     examined = examine(tmp_path, with_units(d, **factors))
     made = draft(ask(examined, interactive=False)[0])
     found = made.examined.proposals.by_channel
@@ -1156,30 +1130,26 @@ def test_a_wrong_gain_that_nothing_else_explains_leaves_out_all_that_may_be_wron
         left_out(tmp_path, table)
 
 
-def test_tilt_is_asked_where_accelerations_may_be_reversed_as_those_of_a_telephone(tmp_path):
-    d = drive()
+def test_tilt_is_asked_where_accelerations_may_be_reversed_as_those_of_a_telephone(tmp_path, d):
     table = with_units(d, ay=-1.0, ax=-1.0).assign(**{"roll [rad]": 0.01 * d["ay"]})
     found = proposed(tmp_path, table)
     assert (found["ax"].sign, found["ay"].sign, found["yaw_rate"].sign) == (-1, -1, 1)
     assert "only its accelerations are reversed" in found["roll"].question
 
 
-def test_an_unnamed_angle_that_no_wheel_turns_by_is_no_steering_command(tmp_path):
-    d = drive()
+def test_an_unnamed_angle_that_no_wheel_turns_by_is_no_steering_command(tmp_path, d):
     table = with_units(d).drop(columns="steering wheel [deg]")
     channels, open_questions = left_out(tmp_path, table.assign(**{"aux [rad]": 0.2 * d["steer"]}))
     assert "aux [rad]" not in channels.values()
     assert open_questions["aux [rad]"].proposed == "-"
 
 
-def test_wheels_named_wsp_are_wheels(tmp_path):
-    d = drive()
+def test_wheels_named_wsp_are_wheels(tmp_path, d):
     table = with_units(d).assign(**wheels_of(d, "WSP_{} [km/h]", 3.6 * RADIUS))
     assert {f"wheel_speed_{corner}" for corner in CORNERS} <= set(proposed(tmp_path, table))
 
 
-def test_recordings_by_a_column_of_laps_are_named_as_such(tmp_path):
-    d = drive()
+def test_recordings_by_a_column_of_laps_are_named_as_such(tmp_path, d):
     table = with_units(d)
     laps = np.searchsorted([50.0, 90.0], d["t"], side="right")
     table["t [s]"] = d["t"] - np.array([0.0, 50.0, 90.0])[laps]
@@ -1211,8 +1181,7 @@ def test_a_slow_clock_without_a_unit_is_read_in_the_one_that_makes_a_rate():
     assert (clock.unit, clock.asked) == ("ns", True)
 
 
-def test_rows_that_are_written_twice_are_left_out_and_said(tmp_path):
-    table = usual(drive())
+def test_rows_that_are_written_twice_are_left_out_and_said(tmp_path, table):
     table = pd.concat([table[:1000], table[999:1000], table[1000:]], ignore_index=True)
     log_draft = drafted(tmp_path, table)
     assert log_draft.dataset["drop_rows"] == {"lap": [1001]}
@@ -1220,8 +1189,7 @@ def test_rows_that_are_written_twice_are_left_out_and_said(tmp_path):
     assert len(read_back(log_draft)) == len(table) - 1
 
 
-def test_a_steering_command_in_counts_is_left_out_unless_its_scale_is_answered(tmp_path):
-    d = drive()
+def test_a_steering_command_in_counts_is_left_out_unless_its_scale_is_answered(tmp_path, d):
     counts = np.round(1500.0 + 8000.0 * d["steer"])
     examined = examine(tmp_path, usual(d).drop(columns="Steer").assign(steer_us=counts))
     answered, left = ask(examined, interactive=False)
@@ -1252,10 +1220,8 @@ def test_ms_and_g_behind_the_name_of_a_velocity_or_an_acceleration_are_its_unit(
 
 @pytest.mark.parametrize("is_sorted", [True, False])
 def test_rows_of_several_rasters_by_their_times_or_one_after_the_other_are_read(
-    tmp_path, is_sorted
+    tmp_path, is_sorted, d, table
 ):
-    d = drive()
-    table = usual(d)
     slow = table[["Time [s]", "Speed", "Beta"]][::2]
     slow = slow.assign(**{"Time [s]": slow["Time [s]"] + 0.003})
     mixed = pd.concat([table.drop(columns=["Speed", "Beta"]), slow])
@@ -1296,8 +1262,7 @@ def test_the_unit_says_of_what_a_name_is(name, unit, role):
     assert max(hints(name, unit).items(), key=lambda role_score: role_score[1])[0] == role
 
 
-def test_a_speed_that_is_negative_in_reverse_is_the_speed(tmp_path):
-    d = drive()
+def test_a_speed_that_is_negative_in_reverse_is_the_speed(tmp_path, d):
     back = {
         name: -d[name][::-1] if name in ("vx", "vy", "r") else d[name][::-1]
         for name in d
@@ -1319,8 +1284,7 @@ def test_a_speed_that_is_negative_in_reverse_is_the_speed(tmp_path):
     } == {(1, "")}
 
 
-def test_a_drive_mostly_in_reverse_keeps_the_sign_of_its_speed_with_a_note(tmp_path):
-    d = drive()
+def test_a_drive_mostly_in_reverse_keeps_the_sign_of_its_speed_with_a_note(tmp_path, d):
     d["vx"] = -0.2 * d["vx"] * np.where(d["t"] < 90.0, 1.0, -0.6)
     d["ay"] = d["vx"] * d["r"]
     d["ax"] = np.gradient(d["vx"], d["t"])
@@ -1330,8 +1294,7 @@ def test_a_drive_mostly_in_reverse_keeps_the_sign_of_its_speed_with_a_note(tmp_p
 
 
 @pytest.mark.parametrize("with_ax", [False, True])
-def test_a_drive_in_reverse_with_a_speed_without_sign_is_noted_with_a_remedy(tmp_path, with_ax):
-    d = drive()
+def test_a_drive_in_reverse_with_a_speed_without_sign_is_noted_with_a_remedy(tmp_path, with_ax, d):
     d["vx"] = -0.2 * d["vx"]
     d["ay"] = d["vx"] * d["r"]
     d["ax"] = np.gradient(d["vx"], d["t"])
@@ -1351,8 +1314,7 @@ def test_a_drive_in_reverse_with_a_speed_without_sign_is_noted_with_a_remedy(tmp
         np.testing.assert_allclose(recording[name], samples, atol=1e-3)
 
 
-def test_no_reverse_is_suspected_of_a_slow_car_whose_ax_says_ahead(tmp_path):
-    d = drive()
+def test_no_reverse_is_suspected_of_a_slow_car_whose_ax_says_ahead(tmp_path, d):
     d["vx"] = 0.2 * d["vx"]
     d["ay"] = -d["vx"] * d["r"]  # to the right
     d["ax"] = np.gradient(d["vx"], d["t"])
@@ -1361,14 +1323,15 @@ def test_no_reverse_is_suspected_of_a_slow_car_whose_ax_says_ahead(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["EKF_beta", "beta_est"])
-def test_a_reference_that_is_named_as_an_estimate_is_asked(tmp_path, name):
-    table = usual(drive()).rename(columns={"Beta": name})
+def test_a_reference_that_is_named_as_an_estimate_is_asked(tmp_path, name, table):
+    table = table.rename(columns={"Beta": name})
     reference = proposed(tmp_path, table)["sideslip_ref"]
     assert (reference.column, reference.question[:27]) == (name, "it is named as an estimate:")
 
 
-def test_a_speed_in_an_unknown_unit_is_scaled_by_that_of_the_reference_wherever_it_stands(tmp_path):
-    d = drive()
+def test_a_speed_in_an_unknown_unit_is_scaled_by_that_of_the_reference_wherever_it_stands(
+    tmp_path, d
+):
     table = pd.DataFrame(
         {
             "t": d["t"],
@@ -1396,9 +1359,9 @@ def test_a_speed_in_an_unknown_unit_is_scaled_by_that_of_the_reference_wherever_
     ],
 )
 def test_names_in_encodings_of_other_scripts_are_read_and_windows_1252_is_not_taken_for_them(
-    tmp_path, encoding, speed, rate
+    tmp_path, encoding, speed, rate, table
 ):
-    table = usual(drive()).rename(columns={"Speed": speed, "Gyro": rate})
+    table = table.rename(columns={"Speed": speed, "Gyro": rate})
     examined = examine(tmp_path, table, encoding=encoding)
     assert [examined.proposals.by_channel[name].column for name in ("vx", "yaw_rate")] == [
         speed,
@@ -1407,8 +1370,7 @@ def test_names_in_encodings_of_other_scripts_are_read_and_windows_1252_is_not_ta
     assert read_back(draft(examined))["vx"].mean() == pytest.approx(drive()["vx"].mean(), rel=1e-3)
 
 
-def test_scaled_units_of_a_header_are_read_and_unknown_ones_are_said(tmp_path):
-    d = drive()
+def test_scaled_units_of_a_header_are_read_and_unknown_ones_are_said(tmp_path, d):
     table = pd.DataFrame(
         {
             "t": d["t"],
@@ -1443,20 +1405,19 @@ def test_scaled_units_of_a_header_are_read_and_unknown_ones_are_said(tmp_path):
         )
 
 
-def test_files_of_two_cars_are_told_of_and_those_of_one_are_not(tmp_path):
-    table = usual(drive())
+def test_files_of_two_cars_are_told_of_and_those_of_one_are_not(tmp_path, table):
     files = [
         write(tmp_path / "lap_1.csv", table),
         write(tmp_path / "lap_2.csv", usual(drive(100.0))),
     ]
-    assert not draft(inspect("my_car", files)).remarks
+    assert not draft(inspected(*files)).remarks
     write(files[1], usual(drive(100.0)).assign(Steer=1.5 * table["Steer"]))
-    (remark,) = draft(inspect("my_car", files)).remarks
+    (remark,) = draft(inspected(*files)).remarks
     assert remark.startswith("handwheel: in 'lap_2' its gain in turns is 1.5 times that in 'lap_1'")
     write(
         files[1], usual(drive(100.0)).assign(Steer=0.0)
     )  # a sensor that is not plugged in is no other car
-    assert not any("another car" in remark for remark in draft(inspect("my_car", files)).remarks)
+    assert not any("another car" in remark for remark in draft(inspected(*files)).remarks)
 
 
 def test_noise_on_a_straight_and_a_slide_are_no_other_car(tmp_path):
@@ -1472,12 +1433,11 @@ def test_noise_on_a_straight_and_a_slide_are_no_other_car(tmp_path):
         write(tmp_path / "lap_1.csv", usual(drive())),
         write(tmp_path / "lap_2.csv", usual(slide)),
     ]
-    assert not any("gain in turns" in remark for remark in draft(inspect("my_car", files)).remarks)
+    assert not any("gain in turns" in remark for remark in draft(inspected(*files)).remarks)
 
 
-def test_a_speed_without_sign_is_told_of_where_the_car_goes_backwards(tmp_path):
-    d = drive()
-    table = usual(d).drop(columns="Beta")
+def test_a_speed_without_sign_is_told_of_where_the_car_goes_backwards(tmp_path, d, table):
+    table = table.drop(columns="Beta")
     slow = 3.0 / d["vx"]
     back = slice(2000, 2500)
     table.loc[2000:2499, "Speed"] = 10.8
@@ -1489,25 +1449,22 @@ def test_a_speed_without_sign_is_told_of_where_the_car_goes_backwards(tmp_path):
     )
 
 
-def test_a_column_that_run_would_refuse_in_the_second_file_is_left_out_unless_answered(tmp_path):
-    d = drive()
+def test_a_column_that_run_would_refuse_in_the_second_file_is_left_out_unless_answered(tmp_path, d):
     table = (
         usual(d).assign(Steer=np.degrees(d["steer"])).rename(columns={"Steer": "RoadWheel [deg]"})
     )
     write(tmp_path / "lap_1.csv", table)
     second_lap = table[:5000].copy()
     second_lap.loc[100:200, "RoadWheel [deg]"] = 170.0
-    examined = inspect(
-        "my_car", [tmp_path / "lap_1.csv", write(tmp_path / "lap_2.csv", second_lap)]
-    )
+    examined = inspected(tmp_path / "lap_1.csv", write(tmp_path / "lap_2.csv", second_lap))
     assert {question.key: question.proposed for question in questions_of(examined)}[
         "RoadWheel [deg]"
     ] == "-"
     assert "steer" not in draft(ask(examined, interactive=False)[0]).channels
 
 
-def test_the_sign_of_a_steering_wheel_that_follows_nothing_is_asked(tmp_path):
-    table = usual(drive()).rename(columns={"Steer": "SteeringWheelAngle [deg]"})
+def test_the_sign_of_a_steering_wheel_that_follows_nothing_is_asked(tmp_path, table):
+    table = table.rename(columns={"Steer": "SteeringWheelAngle [deg]"})
     assert not proposed(tmp_path, table)["handwheel"].question
     table["SteeringWheelAngle [deg]"] = 40.0 * np.random.default_rng(1).standard_normal(len(table))
     assert proposed(tmp_path, table)["handwheel"].question
@@ -1563,8 +1520,7 @@ def test_a_counter_of_time_that_wraps_goes_on(tmp_path, name):
     )
 
 
-def test_rows_out_of_order_are_sorted_and_restarts_are_cut_with_a_note(tmp_path):
-    table = usual(drive())
+def test_rows_out_of_order_are_sorted_and_restarts_are_cut_with_a_note(tmp_path, table):
     rows = np.arange(6000)
     rows[500:503] = [502, 500, 501]
     rows[3000:5000:100], rows[3001:5001:100] = (
@@ -1587,8 +1543,7 @@ def test_rows_out_of_order_are_sorted_and_restarts_are_cut_with_a_note(tmp_path)
     assert "a command on a single recording uses the longest, 80 of 120 s" in note
 
 
-def test_a_clock_that_is_set_back_for_a_while_ends_a_recording_and_mixes_no_rows(tmp_path):
-    table = usual(drive())
+def test_a_clock_that_is_set_back_for_a_while_ends_a_recording_and_mixes_no_rows(tmp_path, table):
     table.loc[2500:2599, "Time [s]"] -= 0.7
     log_draft = drafted(tmp_path, table)
     assert [round(seconds) for seconds in log_draft.durations.values()] == [50, 71]
@@ -1611,8 +1566,7 @@ def test_a_speed_is_compared_with_ay_less_the_change_of_the_lateral_velocity(tmp
     assert any("'vx' is " in note for note in notes) == (excess > 1.0)
 
 
-def test_the_course_decides_left_and_right_though_the_car_stands_for_a_while(tmp_path):
-    d = drive()
+def test_the_course_decides_left_and_right_though_the_car_stands_for_a_while(tmp_path, d):
     stand = np.zeros(1500)
     vx, rate = (np.concatenate([stand, d[name], stand]) for name in ("vx", "r"))
     noise = np.random.default_rng(1).standard_normal((2, 9000))
@@ -1625,8 +1579,7 @@ def test_the_course_decides_left_and_right_though_the_car_stands_for_a_while(tmp
     assert (proposals.by_channel["yaw_rate"].sign, proposals.by_channel["ay"].sign) == (-1, -1)
 
 
-def test_a_log_without_accelerations_has_no_lateral_velocity_or_path_error_as_one(tmp_path):
-    d = drive()
+def test_a_log_without_accelerations_has_no_lateral_velocity_or_path_error_as_one(tmp_path, d):
     table = pd.DataFrame(
         {
             "t": d["t"],
@@ -1649,8 +1602,7 @@ def test_a_log_without_accelerations_has_no_lateral_velocity_or_path_error_as_on
     assert '--answer "Ux=vx m/s"' in open_questions["Ux"].text
 
 
-def test_a_relation_alone_is_a_question_and_a_name_a_unit_or_ax_makes_it_an_answer(tmp_path):
-    d = drive()
+def test_a_relation_alone_is_a_question_and_a_name_a_unit_or_ax_makes_it_an_answer(tmp_path, d):
     columns = {"a": d["t"], "b": d["vx"], "c": d["r"], "d": d["ay"]}
     with pytest.raises(VehestError, match='--answer "b=vx m/s"'):
         left_out(tmp_path, pd.DataFrame(columns))
@@ -1679,8 +1631,7 @@ def with_y_up(d, sign=1.0):
     )
 
 
-def test_motion_outweighs_the_letters_of_axes_where_a_log_counts_y_up(tmp_path):
-    d = drive()
+def test_motion_outweighs_the_letters_of_axes_where_a_log_counts_y_up(tmp_path, d):
     table = with_y_up(d)
     column_of = {name: proposal.column for name, proposal in proposed(tmp_path, table).items()}
     assert column_of == {
@@ -1698,8 +1649,7 @@ def test_motion_outweighs_the_letters_of_axes_where_a_log_counts_y_up(tmp_path):
     assert "roll_rate" not in proposed(tmp_path, table)  # about X, which is no forward axis here
 
 
-def test_a_unit_behind_the_letter_of_an_axis_does_not_hide_it(tmp_path):
-    d = drive()
+def test_a_unit_behind_the_letter_of_an_axis_does_not_hide_it(tmp_path, d):
     noise = 0.01 * np.random.default_rng(2).standard_normal(len(d["t"]))
     table = usual(d).drop(columns=["LatAcc", "LongAcc", "Beta"])
     table = table.assign(AccX_g=-d["ay"] / G, AccY_g=d["ax"] / G, AccZ_g=1.0 + noise)
@@ -1709,10 +1659,9 @@ def test_a_unit_behind_the_letter_of_an_axis_does_not_hide_it(tmp_path):
     assert "AccZ_g" not in {proposal.column for proposal in by_channel.values()}
 
 
-def test_axes_of_an_accelerometer_without_z_are_read_from_the_motion(tmp_path):
+def test_axes_of_an_accelerometer_without_z_are_read_from_the_motion(tmp_path, d, table):
     """Before, the lateral one was asked and the longitudinal one left out without a word."""
-    d = drive()
-    table = usual(d).drop(columns=["LatAcc", "LongAcc"])
+    table = table.drop(columns=["LatAcc", "LongAcc"])
     table = table.assign(ACC_X=-d["ay"], ACC_Y=d["ax"])
     by_channel = proposed(tmp_path, table)
     assert (by_channel["ay"].column, by_channel["ay"].sign) == ("ACC_X", -1)
@@ -1721,10 +1670,11 @@ def test_axes_of_an_accelerometer_without_z_are_read_from_the_motion(tmp_path):
     assert proposed(tmp_path, table)["ax"].column == "ACC_X"
 
 
-def test_a_yaw_rate_in_degrees_a_minute_without_a_unit_does_not_change_the_speed(tmp_path):
+def test_a_yaw_rate_in_degrees_a_minute_without_a_unit_does_not_change_the_speed(
+    tmp_path, d, table
+):
     """Before, it was read in 0.01 deg/s and the speed in mph, 1.6 times too large."""
-    d = drive()
-    table = usual(d).assign(Gyro=60.0 * np.degrees(d["r"]))
+    table = table.assign(Gyro=60.0 * np.degrees(d["r"]))
     by_channel = proposed(tmp_path, table)
     assert {name: by_channel[name].unit for name in ("vx", "yaw_rate")} == {
         "vx": "km/h",
@@ -1732,12 +1682,11 @@ def test_a_yaw_rate_in_degrees_a_minute_without_a_unit_does_not_change_the_speed
     }
 
 
-def test_two_rare_units_that_fit_a_gain_are_asked(tmp_path):
+def test_two_rare_units_that_fit_a_gain_are_asked(tmp_path, d, table):
     """A speed in rev/min of a motor: before, it was read in 0.01 km/h, and the yaw rate in 0.1
     deg/s without a word.
     """
-    d = drive()
-    table = usual(d).drop(columns=["LongAcc", "Steer", "Beta"])
+    table = table.drop(columns=["LongAcc", "Steer", "Beta"])
     by_channel = proposed(tmp_path, table.assign(Speed=3600.0 * d["vx"]))
     assert all("other units explain" in by_channel[name].question for name in ("vx", "yaw_rate"))
     by_channel = proposed(tmp_path, table.assign(Speed=4300.0 * d["vx"]))  # which no units explain
@@ -1745,9 +1694,8 @@ def test_two_rare_units_that_fit_a_gain_are_asked(tmp_path):
     assert by_channel["yaw_rate"].unit == "deg/s"
 
 
-def test_an_angle_that_no_road_wheel_has_is_that_of_a_steering_wheel(tmp_path):
+def test_an_angle_that_no_road_wheel_has_is_that_of_a_steering_wheel(tmp_path, d):
     """Where the corners do not show the ratio; before, it was a command, in rad for degrees."""
-    d = drive()
     angle = np.degrees(4.0 * d["handwheel"])  # by a ratio that no car has
     table = usual(d).drop(columns="Steer").assign(**{"Steered Angle [deg]": angle})
     proposal = proposed(tmp_path, table)["handwheel"]
@@ -1756,8 +1704,7 @@ def test_an_angle_that_no_road_wheel_has_is_that_of_a_steering_wheel(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["Lean Angle [deg]", "Neigung", "phi [deg]"])
-def test_an_angle_of_lean_is_no_second_lateral_acceleration(tmp_path, name):
-    d = drive()
+def test_an_angle_of_lean_is_no_second_lateral_acceleration(tmp_path, name, d):
     table = usual(d).drop(columns="Steer").assign(**{name: np.degrees(np.arctan(d["ay"] / G))})
     by_channel = proposed(tmp_path, table)
     assert by_channel["ay"].column == "LatAcc"
@@ -1767,8 +1714,7 @@ def test_an_angle_of_lean_is_no_second_lateral_acceleration(tmp_path, name):
     assert any("'AccLat2': correlation" in text for text in repeated.evidence)
 
 
-def test_a_steering_wheel_in_turns_is_read_and_one_of_unknown_scale_left_out(tmp_path):
-    d = drive()
+def test_a_steering_wheel_in_turns_is_read_and_one_of_unknown_scale_left_out(tmp_path, d):
     turns = d["handwheel"] / (2.0 * np.pi)
     table = usual(d).drop(columns="Steer").assign(**{"SteeringWheel [turns]": turns})
     found = drafted(tmp_path, table)
@@ -1781,8 +1727,8 @@ def test_a_steering_wheel_in_turns_is_read_and_one_of_unknown_scale_left_out(tmp
     assert note.endswith("answer its question with CHANNEL UNIT SIGN FACTOR")
 
 
-def test_a_negative_steering_ratio_is_named_and_makes_no_steer(tmp_path):
-    table = usual(drive()).drop(columns="Beta").rename(columns={"Steer": "SWA [deg]"})
+def test_a_negative_steering_ratio_is_named_and_makes_no_steer(tmp_path, table):
+    table = table.drop(columns="Beta").rename(columns={"Steer": "SWA [deg]"})
     examined = replace(examine(tmp_path, table), vehicle={"wheelbase": 2.7, "steering_ratio": None})
     reversed_angle = replace(examined.proposals.by_channel["handwheel"], sign=-1)
     proposals = examined.proposals.changed({"handwheel": reversed_angle})
@@ -1793,9 +1739,8 @@ def test_a_negative_steering_ratio_is_named_and_makes_no_steer(tmp_path):
     assert not is_certain(-15.0, 1.0)
 
 
-def test_offsets_of_a_steering_wheel_and_of_a_speedometer_are_remarks(tmp_path):
-    d = drive()
-    table = usual(d).drop(columns="Beta").rename(columns={"Steer": "SteeringWheelAngle [deg]"})
+def test_offsets_of_a_steering_wheel_and_of_a_speedometer_are_remarks(tmp_path, d, table):
+    table = table.drop(columns="Beta").rename(columns={"Steer": "SteeringWheelAngle [deg]"})
     table["GPS Speed [km/h]"] = 3.6 * d["vx"]
     assert not drafted(tmp_path, table).remarks
     table["SteeringWheelAngle [deg]"] += 4.0
@@ -1807,8 +1752,7 @@ def test_offsets_of_a_steering_wheel_and_of_a_speedometer_are_remarks(tmp_path):
     assert speed.endswith("multiply the channel's factor by 0.9434")
 
 
-def test_a_velocity_along_an_axis_of_the_world_is_no_speed_of_the_car(tmp_path):
-    d = drive()
+def test_a_velocity_along_an_axis_of_the_world_is_no_speed_of_the_car(tmp_path, d):
     east, north, _ = places_of(d, turning=3.0)
     table = pd.DataFrame({"t": d["t"], "Velocity east [m/s]": east, "vel_n [m/s]": north})
     table["Velocity forward [m/s]"] = d["vx"]
@@ -1843,13 +1787,12 @@ def test_a_velocity_along_an_axis_of_the_world_is_no_speed_of_the_car(tmp_path):
     east, north, places = places_of(d, turning=3.0)
     table = pd.DataFrame({"t": d["t"], "Vel_X": east, "Vel_Y": north, **places, "wz": d["r"]})
     table.assign(acc_lat=d["ay"]).to_csv(tmp_path / "places.csv", index=False)
-    by_channel = inspect("my_car", [tmp_path / "places.csv"]).proposals.by_channel
+    by_channel = inspected(tmp_path / "places.csv").proposals.by_channel
     assert "an axis of the world" in by_channel["vx"].question
     assert "an axis of the world" in by_channel["vy_ref"].question
 
 
-def test_gravity_is_no_speed_and_units_that_rest_on_a_speed_left_out_are_too(tmp_path):
-    d = drive()
+def test_gravity_is_no_speed_and_units_that_rest_on_a_speed_left_out_are_too(tmp_path, d):
     noise = np.random.default_rng(0).standard_normal((2, len(d["t"])))
     table = {"t": d["t"], "Gyr_Z": d["r"], "Acc_X": d["ax"], "Acc_Y": d["ay"]}
     by_channel = proposed(tmp_path, pd.DataFrame({**table, "Acc_Z": G + 0.3 * noise[0]}))
@@ -1860,9 +1803,8 @@ def test_gravity_is_no_speed_and_units_that_rest_on_a_speed_left_out_are_too(tmp
     assert channels == {"vy_ref": "VLat"}
 
 
-def test_axes_are_not_read_off_letters_where_errors_of_a_path_agree_as_well(tmp_path):
+def test_axes_are_not_read_off_letters_where_errors_of_a_path_agree_as_well(tmp_path, d):
     """An error of heading named dpsi, like a yaw rate, and a curvature named like nothing."""
-    d = drive()
     table = with_y_up(d, sign=-1.0)
     rates = [name for name in table if name.startswith("Angular")]
     table[rates] = np.degrees(table[rates])
@@ -1883,9 +1825,8 @@ def test_axes_are_not_read_off_letters_where_errors_of_a_path_agree_as_well(tmp_
 
 @pytest.mark.parametrize(("name", "is_left_out"), [("accLong", True), ("LongAcc", False)])
 def test_an_ax_by_name_alone_is_left_out_unless_it_is_of_the_sensor_of_ay(
-    tmp_path, name, is_left_out
+    tmp_path, name, is_left_out, d
 ):
-    d = drive()
     shaking = np.random.default_rng(4).standard_normal(len(d["t"]))
     table = usual(d).assign(LongAcc=shaking).rename(columns={"LongAcc": name})
     channels, open_questions = left_out(tmp_path, table)
@@ -1894,18 +1835,16 @@ def test_an_ax_by_name_alone_is_left_out_unless_it_is_of_the_sensor_of_ay(
 
 @pytest.mark.parametrize(("speed", "is_left_out"), [("Speed", True), ("odom_vx", False)])
 def test_a_vy_by_name_alone_is_left_out_unless_it_is_named_like_the_speed(
-    tmp_path, speed, is_left_out
+    tmp_path, speed, is_left_out, d
 ):
-    d = drive()
     shaking = np.random.default_rng(5).standard_normal(len(d["t"]))
     table = usual(d).drop(columns="Beta").assign(odom_vy=shaking).rename(columns={"Speed": speed})
     channels, open_questions = left_out(tmp_path, table)
     assert ("odom_vy" in open_questions, "vy_ref" not in channels) == (True, is_left_out)
 
 
-def test_a_steering_wheel_that_turns_no_further_than_road_wheels_is_left_out(tmp_path):
-    d = drive()
-    table = usual(d).drop(columns="Steer").assign(Lenkradwinkel=np.degrees(d["steer"]))
+def test_a_steering_wheel_that_turns_no_further_than_road_wheels_is_left_out(tmp_path, d, table):
+    table = table.drop(columns="Steer").assign(Lenkradwinkel=np.degrees(d["steer"]))
     channels, open_questions = left_out(tmp_path, table)
     assert not {"steer", "handwheel"} & set(channels)
     assert "its name suggests a steering wheel" in open_questions["Lenkradwinkel"].text
@@ -1974,9 +1913,8 @@ def test_the_rate_of_a_log_without_times_is_right_though_the_car_slides(tmp_path
     assert proposals_of(tmp_path, table).rate_hz == 50.0
 
 
-def test_a_latitude_is_no_speed(tmp_path):
-    d = drive()
-    table = usual(d).drop(columns=["Speed", "Steer", "Beta"]).assign(**places_of(d)[2])
+def test_a_latitude_is_no_speed(tmp_path, d, table):
+    table = table.drop(columns=["Speed", "Steer", "Beta"]).assign(**places_of(d)[2])
     table = table.rename(columns={"Latitude": "lat", "Longitude": "lon"})
     proposals = proposals_of(tmp_path, table)
     assert not {"lat", "lon"} & {proposal.column for proposal in proposals.channels}
@@ -2021,16 +1959,14 @@ def test_of_two_accelerations_without_a_roll_angle_one_is_asked(tmp_path):
     assert "which one contains gravity?" in ay.question
 
 
-def test_a_rare_unit_of_ax_does_not_decide_the_unit_of_speed(tmp_path):
-    d = drive()
+def test_a_rare_unit_of_ax_does_not_decide_the_unit_of_speed(tmp_path, d):
     frozen = np.where(d["t"] < 30.0, d["r"], d["r"][1500])
     columns = {"time": d["t"], "speed": d["vx"], "yaw_rate": frozen, "ax": d["ax"], "ay": d["ay"]}
     by_channel = proposed(tmp_path, pd.DataFrame(columns))
     assert (by_channel["vx"].unit, by_channel["ax"].unit) == ("m/s", "m/s²")
 
 
-def test_of_factors_that_explain_as_well_that_of_a_unit_is_asked(tmp_path):
-    d = drive()
+def test_of_factors_that_explain_as_well_that_of_a_unit_is_asked(tmp_path, d):
     table = pd.DataFrame(
         {
             "time [s]": d["t"],
@@ -2052,9 +1988,8 @@ def test_of_factors_that_explain_as_well_that_of_a_unit_is_asked(tmp_path):
     }
 
 
-def test_an_inline_acceleration_of_the_unit_goes_before_that_of_the_receiver(tmp_path):
-    d = drive()
-    table = usual(d).rename(columns={"LatAcc": "LateralAcc", "LongAcc": "InlineAcc"})
+def test_an_inline_acceleration_of_the_unit_goes_before_that_of_the_receiver(tmp_path, d, table):
+    table = table.rename(columns={"LatAcc": "LateralAcc", "LongAcc": "InlineAcc"})
     noise = 0.05 * np.random.default_rng(1).standard_normal(len(table))
     table["GPS LonAcc"] = (d["ax"] + noise) / G
     assert proposed(tmp_path, table)["ax"].column == "InlineAcc"
@@ -2074,25 +2009,22 @@ def test_a_column_that_begins_late_is_compared_from_there_on(tmp_path):
             ],
         },
     )
-    evidence = " ".join(inspect("my_car", [tmp_path / "lap.mf4"]).in_words())
+    evidence = " ".join(inspected(tmp_path / "lap.mf4").in_words())
     assert abs(float(re.search(r"gain ([\d.]+)", evidence)[1]) - 1.0) < 0.05
 
 
-def test_a_speed_that_counts_backwards_leaves_the_sign_of_ax_to_a_question(tmp_path):
+def test_a_speed_that_counts_backwards_leaves_the_sign_of_ax_to_a_question(tmp_path, table):
     """x points to the rear, and the drive hardly shows ax against d(vx)/dt."""
-    d = drive()
-    table = usual(d)
     table["Speed"] *= -1.0
     table["LatAcc"] *= -1.0
     noise = 0.2 * np.random.default_rng(0).standard_normal(len(table))
     table["LongAcc [g]"] = -table.pop("LongAcc") + noise
-    proposals = inspect("my_car", [write(tmp_path / "lap.csv", table)]).proposals
+    proposals = examine(tmp_path, table).proposals
     ax = proposals.by_channel["ax"]
     assert (proposals.by_channel["vx"].sign, ax.sign, bool(ax.question)) == (-1, -1, True)
 
 
-def test_a_velocity_along_an_axis_of_the_world_is_no_reference_of_the_speed(tmp_path):
-    d = drive()
+def test_a_velocity_along_an_axis_of_the_world_is_no_reference_of_the_speed(tmp_path, d):
     yaw = 0.25 * np.sin(0.1 * d["t"])  # of a road that hardly turns: vx·cos(yaw) is nearly vx
     yaw += 0.5 * np.sin(0.013 * d["t"])
     table = usual(d).assign(
@@ -2101,15 +2033,14 @@ def test_a_velocity_along_an_axis_of_the_world_is_no_reference_of_the_speed(tmp_
     alone = table.drop(columns="Vel_Frame_Y")
     assert np.corrcoef(table["Vel_Frame_X"], d["vx"])[0, 1] > 0.9
     for logged, is_reference in ((table, False), (alone, True)):
-        channels = inspect("my_car", [write(tmp_path / "lap.csv", logged)]).proposals.channels
+        channels = examine(tmp_path, logged).proposals.channels
         columns = {channel.column for channel in channels}
         assert ("Vel_Frame_X" in columns) == is_reference
         assert "Vel_Frame_Y" not in columns
 
 
-def test_raw_counts_are_no_rare_units_and_the_error_names_the_factor(tmp_path):
+def test_raw_counts_are_no_rare_units_and_the_error_names_the_factor(tmp_path, d):
     """An MPU-6050: 16384 counts a g, 131 counts a degree a second."""
-    d = drive()
     table = pd.DataFrame(
         {
             "millis": np.round(1e3 * d["t"]),
@@ -2118,7 +2049,7 @@ def test_raw_counts_are_no_rare_units_and_the_error_names_the_factor(tmp_path):
             "ay": np.round(16384.0 / G * d["ay"]),
         }
     )
-    examined = inspect("my_car", [write(tmp_path / "lap.csv", table)])
+    examined = examine(tmp_path, table)
     with pytest.raises(ConfigurationError, match="raw counts need a factor: COLUMN=CHANNEL UNIT"):
         ask(examined, [], interactive=False)
     answers = ["gz=yaw_rate deg/s 1 0.0076336", "ay=ay g 1 6.1035e-05", "speed_kmh=vx km/h"]
@@ -2127,11 +2058,12 @@ def test_raw_counts_are_no_rare_units_and_the_error_names_the_factor(tmp_path):
     np.testing.assert_allclose(recording["yaw_rate"], d["r"], atol=1e-3)
 
 
-def test_a_steering_ratio_is_neither_estimated_nor_missed_beside_the_road_wheels_angle(tmp_path):
-    d = drive()
-    table = usual(d).rename(columns={"Steer": "Steer_SW (deg)"})
+def test_a_steering_ratio_is_neither_estimated_nor_missed_beside_the_road_wheels_angle(
+    tmp_path, d, table
+):
+    table = table.rename(columns={"Steer": "Steer_SW (deg)"})
     table["Steer_SW (deg)"] += 5.0 * np.random.default_rng(0).standard_normal(len(table))
     table["Steer_L1 (deg)"] = np.degrees(d["steer"])
     vehicle = {"wheelbase": 2.7, "mass": None, "steering_ratio": None}
-    notes = draft(inspect("my_car", [write(tmp_path / "lap.csv", table)], vehicle)).notes
+    notes = draft(inspected(write(tmp_path / "lap.csv", table), vehicle=vehicle)).notes
     assert not [note for note in notes if "steering ratio" in note]

@@ -13,11 +13,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from mdf_log import write_mdf
-from planted_logs import G, drive, usual, write
+from planted_logs import G, drive, examine, inspected, usual, write
 
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.run.own_car.dataset import draft
-from vehest.run.own_car.inspect import inspect
 from vehest.run.own_car.questions import ask, questions_of
 from vehest.sources.base import open_source
 from vehest.sources.clock_times import seconds_of_text
@@ -26,9 +25,21 @@ from vehest.sources.surveys import survey
 from vehest.sources.surveys.tables import survey_table
 
 
+@pytest.fixture
+def d():
+    """Motion of a known car: name -> (T,), in SI units."""
+    return drive()
+
+
+@pytest.fixture
+def table(d):
+    """Its log under usual names and units."""
+    return usual(d)
+
+
 def read_back(file):
     """The data set's draft, and the recording that its source reads by it."""
-    log_draft = draft(inspect("my_car", [file]))
+    log_draft = draft(inspected(file))
     return log_draft, open_source(log_draft.dataset).read(file.stem)
 
 
@@ -46,8 +57,7 @@ def lines_of(table):
     return table.round(5).to_csv(index=False).splitlines()
 
 
-def test_rows_of_names_units_and_sources_and_a_name_that_stands_twice(tmp_path):
-    d = drive()
+def test_rows_of_names_units_and_sources_and_a_name_that_stands_twice(tmp_path, d):
     names = "t,speed,lateral_acc,speed,y_acc,z_rate"
     head = [
         "A lap timer",
@@ -69,20 +79,18 @@ def test_rows_of_names_units_and_sources_and_a_name_that_stands_twice(tmp_path):
     assert recording.rate_hz == 50.0
 
 
-def test_a_row_of_types_between_names_and_units_holds_no_names(tmp_path):
-    table = usual(drive())
+def test_a_row_of_types_between_names_and_units_holds_no_names(tmp_path, table):
     names, *rows = lines_of(table)
     types = ",".join(["f8"] * len(table.columns))
     file = text_file(tmp_path, "ASCII record", names, types, "s,km/h,deg/s,g,g,deg,deg", *rows)
     assert_yaw_rate_is(read_back(file)[1], table)
-    assert set(inspect("my_car", [file]).log.by_name) == {*table.columns} - {"Time [s]"}
+    assert set(inspected(file).log.by_name) == {*table.columns} - {"Time [s]"}
 
 
 @pytest.mark.parametrize(
     ("of_names", "of_rows"), [(",", ""), ("", ","), ("", ",,"), (",", ",,"), (",,", "")]
 )
-def test_delimiters_at_the_end_of_the_names_or_of_the_rows(tmp_path, of_names, of_rows):
-    table = usual(drive())
+def test_delimiters_at_the_end_of_the_names_or_of_the_rows(tmp_path, of_names, of_rows, table):
     lines = lines_of(table)
     lines = [lines[0] + of_names, *(row + of_rows for row in lines[1:])]
     file = text_file(tmp_path, *lines)
@@ -90,8 +98,8 @@ def test_delimiters_at_the_end_of_the_names_or_of_the_rows(tmp_path, of_names, o
 
 
 @pytest.mark.parametrize("cell", ["1.#INF", "-1.#IND", "#VALUE!", "SNA", "not available", "bad!"])
-def test_one_odd_cell_is_a_missing_sample_that_is_bridged(tmp_path, cell):
-    table = usual(drive()).round(5)
+def test_one_odd_cell_is_a_missing_sample_that_is_bridged(tmp_path, cell, table):
+    table = table.round(5)
     lines = [line.split(",") for line in lines_of(table)]
     lines[701][2] = cell
     file = text_file(tmp_path, *map(",".join, lines))
@@ -103,8 +111,7 @@ def test_one_odd_cell_is_a_missing_sample_that_is_bridged(tmp_path, cell):
     assert len(named) == (cell == "bad!")
 
 
-def test_names_that_are_repeated_in_the_file_are_left_out(tmp_path):
-    table = usual(drive())
+def test_names_that_are_repeated_in_the_file_are_left_out(tmp_path, table):
     lines = lines_of(table)
     file = text_file(tmp_path, *lines[:500], lines[0], *lines[500:])
     log_draft, recording = read_back(file)
@@ -115,12 +122,11 @@ def test_names_that_are_repeated_in_the_file_are_left_out(tmp_path):
 HEAD = ["A logger", "Time,Speed,Gyro,LatAcc,LongAcc,Steer,Beta", "s,km/h,deg/s,g,g,deg,deg"]
 
 
-def test_files_that_were_joined_with_their_headers_are_recordings_of_their_own(tmp_path):
-    table = usual(drive())
+def test_files_that_were_joined_with_their_headers_are_recordings_of_their_own(tmp_path, table):
     table.loc[4000:, "Time [s]"] -= 75.0
     rows = lines_of(table)[1:]
     file = text_file(tmp_path, *HEAD, *rows[:4000], *HEAD, *rows[4000:])
-    log_draft = draft(inspect("my_car", [file]))
+    log_draft = draft(inspected(file))
     assert log_draft.dataset["drop_rows"] == {"lap": [4001, 4002]}
     source = open_source(log_draft.dataset)
     assert source.ids() == ["lap_run_0", "lap_run_1"]
@@ -140,11 +146,11 @@ def test_files_that_were_joined_with_other_names_or_units_are_refused(tmp_path, 
     file = text_file(tmp_path, *HEAD, *rows[:4000], *second, *rows[4000:])
     message = rf"data row 400{line} holds other names or units .* '{new.split(',')[0]}'; save the"
     with pytest.raises(DataError, match=message):
-        inspect("my_car", [file])
+        inspected(file)
 
 
-def test_rows_of_marks_of_missing_samples_alone_stay(tmp_path):
-    table = usual(drive()).drop(columns="Time [s]")
+def test_rows_of_marks_of_missing_samples_alone_stay(tmp_path, table):
+    table = table.drop(columns="Time [s]")
     lines = lines_of(table)
     lines[500] = ",".join(["SNA"] * 6)
     log = survey_table(text_file(tmp_path, *lines))
@@ -152,8 +158,7 @@ def test_rows_of_marks_of_missing_samples_alone_stay(tmp_path):
     assert len(log.by_name["Gyro"].values) == len(table)
 
 
-def test_statistics_above_the_numbers_are_left_out(tmp_path):
-    table = usual(drive())
+def test_statistics_above_the_numbers_are_left_out(tmp_path, table):
     statistics = [
         ",".join([name, *map(str, getattr(table.iloc[:, 1:], name)().round(3))])
         for name in ("min", "max", "mean")
@@ -165,26 +170,24 @@ def test_statistics_above_the_numbers_are_left_out(tmp_path):
     assert_yaw_rate_is(recording, table)
 
 
-def test_a_table_that_gzip_compressed_is_read_once_its_name_says_so(tmp_path):
-    table = usual(drive())
+def test_a_table_that_gzip_compressed_is_read_once_its_name_says_so(tmp_path, table):
     file = write(tmp_path / "lap.csv", table)
     file.write_bytes(gzip.compress(file.read_bytes()))
     with pytest.raises(DataError, match=r"by gzip; let its name end in '\.csv\.gz'"):
-        inspect("my_car", [file])
-    log_draft = draft(inspect("my_car", [file.rename(tmp_path / "lap.csv.gz")]))
+        inspected(file)
+    log_draft = draft(inspected(file.rename(tmp_path / "lap.csv.gz")))
     assert_yaw_rate_is(open_source(log_draft.dataset).read("lap.csv"), table)
 
 
 @pytest.mark.parametrize("time", ["Time [s]", "t [s]"])
 def test_two_files_of_one_drive_are_refused_with_the_command_that_joins_them(
-    tmp_path, monkeypatch, time
+    tmp_path, monkeypatch, time, table
 ):
-    table = usual(drive())
     slow = table[["Time [s]", "Speed"]][::5].rename(columns={"Time [s]": time})
     write(tmp_path / "gnss.csv", slow)
     write(tmp_path / "imu.csv", table.drop(columns="Speed"))
     with pytest.raises(DataError, match="if the files are of one drive") as refused:
-        inspect("my_car", [tmp_path / "imu.csv", tmp_path / "gnss.csv"])
+        inspected(tmp_path / "imu.csv", tmp_path / "gnss.csv")
     monkeypatch.chdir(tmp_path)
     command = str(refused.value).partition("by pandas: ")[2]
     eval(command, {"merge": pd.merge, "read_csv": pd.read_csv})
@@ -195,8 +198,7 @@ def test_two_files_of_one_drive_are_refused_with_the_command_that_joins_them(
 
 
 @pytest.mark.parametrize("below", [["End of measurement", "# EOF"], ["Mean" + ",1.0" * 6, "Max,9"]])
-def test_text_between_and_below_the_rows_is_left_out_and_named(tmp_path, below):
-    table = usual(drive())
+def test_text_between_and_below_the_rows_is_left_out_and_named(tmp_path, below, table):
     lines = lines_of(table)
     below = [line + ",9" * (6 - line.count(",")) if "," in line else line for line in below]
     file = text_file(tmp_path, *lines[:500], "# marker: lap 2", *lines[500:], *below, "")
@@ -214,12 +216,12 @@ def test_a_row_of_numbers_that_is_cut_off_within_the_table_is_an_error(tmp_path)
     for row in ("bad,1.0,2.0", lines[500][:-30]):
         file = text_file(tmp_path, *lines[:500], row, *lines[500:])
         with pytest.raises(DataError, match="Expected 7 columns"):
-            inspect("my_car", [file])
+            inspected(file)
 
 
-def test_a_unit_of_time_that_the_steps_contradict_is_asked_with_the_one_that_fits(tmp_path):
-    table = usual(drive()).rename(columns={"Time [s]": "tow(msec)"})
-    clock = inspect("my_car", [write(tmp_path / "lap.csv", table)]).log.clock
+def test_a_unit_of_time_that_the_steps_contradict_is_asked_with_the_one_that_fits(tmp_path, table):
+    table = table.rename(columns={"Time [s]": "tow(msec)"})
+    clock = examine(tmp_path, table).log.clock
     assert (clock.column, clock.unit, clock.asked) == ("tow(msec)", "s", True)
     assert "50 Hz if in s, 50000 Hz in ms, as the header says" in clock.evidence
 
@@ -248,11 +250,10 @@ TIMES = {
 @pytest.mark.parametrize(
     ("unit", "seconds"), [("h", 3600.0), ("min", 60.0), ("1/100 s", 0.01), ("秒", 1.0)]
 )
-def test_a_unit_of_time_is_read_where_the_header_states_it(tmp_path, unit, seconds):
-    table = usual(drive())
+def test_a_unit_of_time_is_read_where_the_header_states_it(tmp_path, unit, seconds, table):
     table["Time [s]"] /= seconds
-    file = exact(tmp_path / "lap.csv", table.rename(columns={"Time [s]": f"time [{unit}]"}))
-    clock = inspect("my_car", [file]).log.clock
+    file = exact(tmp_path, table.rename(columns={"Time [s]": f"time [{unit}]"}))
+    clock = inspected(file).log.clock
     assert (clock.asked, read_back(file)[1].rate_hz) == (False, 50.0)
 
 
@@ -277,8 +278,8 @@ def test_fixes_of_a_receiver_of_1_hz_are_bridged_though_they_jitter(tmp_path):
 
 
 @pytest.mark.parametrize("times", ["fewer", "others"])
-def test_a_column_of_times_for_each_channel_is_refused(tmp_path, times):
-    table = usual(drive()).rename(columns={"Time [s]": "Time_v [s]"})
+def test_a_column_of_times_for_each_channel_is_refused(tmp_path, times, table):
+    table = table.rename(columns={"Time [s]": "Time_v [s]"})
     lateral = table[["Gyro", "LatAcc"]].assign(**{"Time_r [ms]": 1e3 * table["Time_v [s]"]})
     if times == "fewer":
         lateral = lateral[::5].reset_index(drop=True)
@@ -286,11 +287,10 @@ def test_a_column_of_times_for_each_channel_is_refused(tmp_path, times):
         lateral["Time_r [ms]"] = 120e3 * np.linspace(0.0, 1.0, 6000) ** 1.1
     table = pd.concat([table.drop(columns=["Gyro", "LatAcc"]), lateral], axis=1)
     with pytest.raises(DataError, match=r"of times, Time_v \[s\], Time_r \[ms\], which differ"):
-        inspect("my_car", [write(tmp_path / "lap.csv", table)])
+        examine(tmp_path, table)
 
 
-def test_further_columns_of_times_that_agree_or_count_otherwise_are_read(tmp_path):
-    table = usual(drive())
+def test_further_columns_of_times_that_agree_or_count_otherwise_are_read(tmp_path, table):
     seconds = table["Time [s]"]
     table = table.assign(
         **{
@@ -315,8 +315,7 @@ DURATIONS = {
 
 
 @pytest.mark.parametrize("name", DURATIONS)
-def test_durations_are_times(tmp_path, name):
-    table = usual(drive())
+def test_durations_are_times(tmp_path, name, table):
     table["Time [s]"] = table["Time [s]"].map(DURATIONS[name])
     _, recording = read_back(
         write(tmp_path / "lap.csv", table.rename(columns={"Time [s]": "Elapsed"}))
@@ -326,8 +325,7 @@ def test_durations_are_times(tmp_path, name):
 
 
 @pytest.mark.parametrize("name", TIMES)
-def test_times_of_a_clock_in_other_forms_go_on_past_midnight(tmp_path, name):
-    table = usual(drive())
+def test_times_of_a_clock_in_other_forms_go_on_past_midnight(tmp_path, name, table):
     table["Time [s]"] = clock_texts(TIMES[name])
     table = table.rename(columns={"Time [s]": "Time"})
     log_draft, recording = read_back(write(tmp_path / "lap.csv", table))
@@ -340,8 +338,7 @@ def test_text_that_is_no_time_is_none():
         assert seconds_of_text(pa.chunked_array([[text, text]])) is None
 
 
-def test_durations_of_parquet_are_times_and_columns_that_are_not_read_are_named(tmp_path):
-    table = usual(drive())
+def test_durations_of_parquet_are_times_and_columns_that_are_not_read_are_named(tmp_path, table):
     stored = table.assign(ok=True, note="x")
     stored["Time [s]"] = pd.to_timedelta(table["Time [s]"], unit="s")
     file = tmp_path / "lap.parquet"
@@ -362,7 +359,7 @@ def long_format(header="time,lap,telemetry_name,telemetry_value", n_rows=200):
 def test_a_trace_of_pcan_is_named_as_a_log_of_a_bus(tmp_path):
     (tmp_path / "lap.trc").write_text(";$FILEVERSION=1.1\n 1) 0.0 Rx 0101 1 D8\n", encoding="utf-8")
     with pytest.raises(DataError, match=r"is a log of a CAN bus.*vehest new my_car lap.trc"):
-        inspect("my_car", [tmp_path / "lap.trc"])
+        inspected(tmp_path / "lap.trc")
 
 
 @pytest.mark.parametrize("has_pauses", [False, True])
@@ -376,7 +373,7 @@ def test_the_rate_by_times_that_repeat_is_that_of_the_rows_between_pauses(tmp_pa
     ].round(2)
     is_paused = ((times > 10.0) & (times < 18.0)) | ((times > 40.0) & (times < 43.0))
     write(tmp_path / "lap.csv", table[~is_paused] if has_pauses else table)
-    examined = inspect("my_car", [tmp_path / "lap.csv"])
+    examined = inspected(tmp_path / "lap.csv")
     assert examined.rate_hz == 100.0
     assert "rate" in [question.key for question in questions_of(examined)]
     is_named = any("2 pauses of 'Time" in note for note in examined.proposals.notes)
@@ -388,9 +385,9 @@ def test_a_table_that_writes_its_rows_several_times_is_refused_with_the_way_out(
     n_times = np.random.default_rng(0).integers(2, 6, len(table))
     file = write(tmp_path / "lap.csv", table.loc[np.repeat(table.index, n_times)])
     with pytest.raises(DataError, match=r"repeats 3\d\d\d of its .* rows.*drop_duplicates"):
-        inspect("my_car", [file])
+        inspected(file)
     write(file, pd.read_csv(file).drop_duplicates())
-    assert inspect("my_car", [file]).log.rate_hz is None
+    assert inspected(file).log.rate_hz is None
     assert read_back(file)[1].rate_hz == 20.0
 
 
@@ -470,7 +467,7 @@ UNSUITED = {
 def test_a_file_without_a_column_a_signal_is_named_with_the_way_out(tmp_path, name):
     text, message_part = UNSUITED[name]
     with pytest.raises(DataError) as refused:
-        inspect("my_car", [text_file(tmp_path, text)])
+        inspected(text_file(tmp_path, text))
     assert message_part in str(refused.value)
 
 
@@ -478,23 +475,21 @@ def test_long_format_in_parquet_is_named_too(tmp_path):
     long = usual(drive(10.0)).melt("Time [s]", var_name="signal", value_name="value")
     long.to_parquet(tmp_path / "lap.parquet")
     with pytest.raises(DataError, match="'signal' names the quantity, 'value' holds it"):
-        inspect("my_car", [tmp_path / "lap.parquet"])
+        inspected(tmp_path / "lap.parquet")
 
 
-def test_decimal_commas_in_quotes_between_commas_are_read(tmp_path):
-    table = usual(drive())
+def test_decimal_commas_in_quotes_between_commas_are_read(tmp_path, table):
     lines = [[f'"{cell}"' for cell in line.split(",")] for line in lines_of(table)]
     text = "\n".join(",".join(cells).replace(".", ",") for cells in lines)
     assert_yaw_rate_is(read_back(text_file(tmp_path, text))[1], table)
 
 
-def test_a_column_of_names_beside_columns_of_signals_is_no_long_format(tmp_path):
-    table = usual(drive()).assign(name="lap", value=np.arange(6000) % 50)
-    assert inspect("my_car", [write(tmp_path / "lap.csv", table)]).proposals.by_channel["ay"]
+def test_a_column_of_names_beside_columns_of_signals_is_no_long_format(tmp_path, table):
+    table = table.assign(name="lap", value=np.arange(6000) % 50)
+    assert examine(tmp_path, table).proposals.by_channel["ay"]
 
 
-def test_a_sideslip_angle_without_meaning_at_crawl_is_taken_as_zero_there(tmp_path):
-    d = drive()
+def test_a_sideslip_angle_without_meaning_at_crawl_is_taken_as_zero_there(tmp_path, d):
     ramp = np.clip((d["t"] - 5.0) / 10.0, 0.0, 1.0)
     random = np.random.default_rng(0)
     d |= {name: ramp * d[name] for name in ("vx", "r", "vy")}
@@ -511,9 +506,7 @@ def test_a_sideslip_angle_without_meaning_at_crawl_is_taken_as_zero_there(tmp_pa
 
 
 @pytest.mark.parametrize("code", [-9999.0, 1e20, 327.67, 3.4028e38, 409.5, -128.0])
-def test_numbers_that_loggers_write_for_nothing_are_missing_samples(tmp_path, code):
-    d = drive()
-    table = usual(d)
+def test_numbers_that_loggers_write_for_nothing_are_missing_samples(tmp_path, code, table):
     expected = np.radians(table["Gyro"].copy())
     for first in (300, 900, 1500):
         table.loc[first : first + 5, ["Gyro", "Speed"]] = code
@@ -536,29 +529,25 @@ def test_a_value_within_the_range_of_the_others_is_no_code():
     ]
 
 
-def exact(file, table):
+def exact(folder, table):
     """A table of text with all digits."""
+    file = folder / "lap.csv"
     table.to_csv(file, index=False)
     return file
 
 
-def test_days_of_a_spreadsheet_are_a_clock(tmp_path):
-    d = drive()
-    table = usual(d)
+def test_days_of_a_spreadsheet_are_a_clock(tmp_path, table):
     name = table.columns[0]
     table[name] = 45000.5 + table[name] / 86_400.0
-    log_draft, recording = read_back(
-        exact(tmp_path / "lap.csv", table.rename(columns={name: "Timestamp"}))
-    )
+    log_draft, recording = read_back(exact(tmp_path, table.rename(columns={name: "Timestamp"})))
     assert log_draft.dataset["time"] == {"column": "Timestamp", "unit": "d"}
     assert recording.rate_hz == 50.0
 
 
-def test_stamps_that_no_unit_of_time_explains_are_no_clock(tmp_path):
-    table = usual(drive())
+def test_stamps_that_no_unit_of_time_explains_are_no_clock(tmp_path, table):
     name = table.columns[0]
     table[name] = 1e-8 * table[name]
-    log = survey_table(exact(tmp_path / "lap.csv", table.rename(columns={name: "time"})))
+    log = survey_table(exact(tmp_path, table.rename(columns={name: "time"})))
     assert log.clock is None
 
 
@@ -573,8 +562,7 @@ def test_stamps_that_no_unit_of_time_explains_are_no_clock(tmp_path):
         (lambda v: f"[{v:.4f} 0.02 -1e-05]", "brackets around several of them, such as '["),
     ],
 )
-def test_numbers_that_are_no_numbers_for_a_program_are_named(tmp_path, cell, message_part):
-    table = usual(drive())
+def test_numbers_that_are_no_numbers_for_a_program_are_named(tmp_path, cell, message_part, table):
     lines = [",".join(table.columns)]
     for row in table.itertuples(index=False):
         cells = [f"{value:.5f}" for value in row]
@@ -635,8 +623,7 @@ def test_nested_columns_of_parquet_are_named_with_the_way_out(tmp_path):
     ]
 
 
-def test_columns_that_are_aligned_by_blanks_are_named_with_the_way_out(tmp_path):
-    table = usual(drive())
+def test_columns_that_are_aligned_by_blanks_are_named_with_the_way_out(tmp_path, table):
     file = tmp_path / "lap.txt"
     file.write_text(table.round(4).to_string(index=False), encoding="utf-8")
     with pytest.raises(
@@ -645,8 +632,7 @@ def test_columns_that_are_aligned_by_blanks_are_named_with_the_way_out(tmp_path)
         survey_table(file)
 
 
-def test_decimals_of_parquet_are_numbers(tmp_path):
-    table = usual(drive())
+def test_decimals_of_parquet_are_numbers(tmp_path, table):
     stored = pa.Table.from_pandas(table, preserve_index=False)
     at = stored.column_names.index("Gyro")
     gyro = pa.array(np.round(table["Gyro"].to_numpy(), 4)).cast(pa.decimal128(12, 4))
@@ -660,7 +646,7 @@ def test_a_folder_of_tables_is_refused_with_the_names_of_its_files(tmp_path):
         (tmp_path / f"part-{number}.parquet").touch()
     (tmp_path / "_SUCCESS").touch()
     with pytest.raises(MissingError, match=r"such as .*\*\.parquet"):
-        inspect("my_car", [tmp_path])
+        inspected(tmp_path)
 
 
 def test_minutes_and_seconds_are_times():
@@ -681,8 +667,7 @@ def test_minutes_and_seconds_are_times():
         (("1/100 km/h", "1/100°/s", "1/1000 g"), (0.01 / 3.6, np.radians(0.01), 1e-3 * G)),
     ],
 )
-def test_units_of_loggers_that_write_whole_numbers(tmp_path, units, factors):
-    d = drive()
+def test_units_of_loggers_that_write_whole_numbers(tmp_path, units, factors, d):
     channels = {"vx": ("Speed", d["vx"]), "yaw_rate": ("Yaw Rate", d["r"])}
     channels["ay"] = ("Lat Acc", d["ay"])
     table = {"time [s]": d["t"]}
@@ -693,12 +678,11 @@ def test_units_of_loggers_that_write_whole_numbers(tmp_path, units, factors):
         np.testing.assert_allclose(recording[channel], samples, atol=1e-3)
 
 
-def test_a_yaw_rate_in_thousandths_of_a_degree_is_found_without_a_unit(tmp_path):
-    d = drive()
+def test_a_yaw_rate_in_thousandths_of_a_degree_is_found_without_a_unit(tmp_path, d):
     table = pd.DataFrame(
         {"t": d["t"], "speed": d["vx"], "yaw_rate": np.degrees(d["r"]) * 1e3, "ay": d["ay"]}
     )
-    channels = inspect("my_car", [write(tmp_path / "lap.csv", table)]).proposals.by_channel
+    channels = examine(tmp_path, table).proposals.by_channel
     assert channels["yaw_rate"].unit == "mdeg/s"
     assert channels["vx"].unit == "m/s"
 
@@ -731,12 +715,11 @@ def test_the_unit_of_time_is_as_the_header_states_or_asked_where_it_states_none(
     ],
 )
 def test_a_unit_of_time_that_the_motion_contradicts_is_asked_with_the_one_that_fits(
-    tmp_path, name, ticks_per_second, start, unit
+    tmp_path, name, ticks_per_second, start, unit, table
 ):
-    table = usual(drive())
     ticks = start + np.rint(ticks_per_second * table["Time [s]"]).astype(np.int64)
     table = table.drop(columns="Time [s]").assign(**{name: ticks})
-    log_draft, recording = read_back(exact(tmp_path / "lap.csv", table))
+    log_draft, recording = read_back(exact(tmp_path, table))
     assert log_draft.examined.log.clock.asked
     assert log_draft.dataset["time"] == {"column": name, "unit": unit}
     assert recording.rate_hz == pytest.approx(50.0, rel=1e-6)
@@ -756,15 +739,14 @@ def test_a_unit_of_time_that_the_motion_contradicts_is_asked_with_the_one_that_f
         "Fréquence d'échantillonnage : 100 Hz",
     ],
 )
-def test_the_rate_that_a_line_above_the_names_states_decides_the_unit_of_time(tmp_path, line):
-    d = drive()
+def test_the_rate_that_a_line_above_the_names_states_decides_the_unit_of_time(tmp_path, line, d):
     table = pd.DataFrame(
         {"Ticks": 1e4 * d["t"] * 0.5, "Gyr_Z": d["r"], "Acc_Y": d["ay"], "Acc_X": d["ax"]}
     )
-    examined = inspect("my_car", [text_file(tmp_path, line, *lines_of(table))])
+    examined = inspected(text_file(tmp_path, line, *lines_of(table)))
     assert (examined.log.clock.unit, examined.log.clock.asked) == ("0.1*ms", True)
     without_times = lines_of(table.drop(columns="Ticks"))
-    assert inspect("my_car", [text_file(tmp_path, line, *without_times)]).rate_hz == 100.0
+    assert inspected(text_file(tmp_path, line, *without_times)).rate_hz == 100.0
 
 
 @pytest.mark.parametrize(
@@ -788,12 +770,13 @@ def test_a_line_that_states_no_rate_of_a_logger_changes_nothing(tmp_path, line):
     ("name", "resolution", "mean_hz"),
     [("Time", 0.024, 50.0), ("Time [ms]", 24.0, 50.0), ("", 0.02, 50.0)],
 )
-def test_times_that_are_no_clock_give_the_rate_with_a_note(tmp_path, name, resolution, mean_hz):
-    table = usual(drive())
+def test_times_that_are_no_clock_give_the_rate_with_a_note(
+    tmp_path, name, resolution, mean_hz, table
+):
     scale = 1e3 if "ms" in name else 1.0
     times = np.round(scale * table["Time [s]"] / resolution) * resolution
     table = table.rename(columns={"Time [s]": name}).assign(**{name: times})
-    examined = inspect("my_car", [write(tmp_path / "lap.csv", table)])
+    examined = examine(tmp_path, table)
     assert (examined.log.clock, examined.rate_hz) == (None, mean_hz)
     (question,) = (question for question in questions_of(examined) if question.key == "rate")
     assert question.evidence == ("by the times of a column that is not read, on average",)
@@ -821,15 +804,14 @@ def test_a_column_that_is_no_clock_gives_no_rate_unless_it_grows_with_the_rows(t
         assert survey_table(write(tmp_path / "lap.csv", table)).rate_hz is None
 
 
-def test_times_that_are_no_numbers_for_a_program_are_refused(tmp_path):
-    table = usual(drive()).rename(columns={"Time [s]": "Time [ms]"})
+def test_times_that_are_no_numbers_for_a_program_are_refused(tmp_path, table):
+    table = table.rename(columns={"Time [s]": "Time [ms]"})
     table["Time [ms]"] = [f"{1e3 * seconds:,.1f}" for seconds in table["Time [ms]"]]
     with pytest.raises(DataError, match=r"column 'Time \[ms\]' holds numbers with a separator of"):
         survey_table(write(tmp_path / "lap.csv", table))
 
 
-def test_recordings_of_a_full_minute_are_no_counter_that_wraps(tmp_path):
-    table = usual(drive())
+def test_recordings_of_a_full_minute_are_no_counter_that_wraps(tmp_path, table):
     table["Time [s]"] %= 60.0
     log = survey_table(write(tmp_path / "lap.csv", table))
     assert [run.stop - run.start for run in log.runs] == [3000, 3000]
@@ -851,8 +833,7 @@ def test_units_may_stand_above_the_names_and_descriptions_below(tmp_path):
     ("whole", "part", "scale"),
     [("Time", "Millisecond", 1000), ("sec", "usec", 10**6), ("stamp.sec", "stamp.nanosec", 10**9)],
 )
-def test_parts_of_seconds_beside_whole_ones_are_the_clock(tmp_path, whole, part, scale):
-    table = usual(drive())
+def test_parts_of_seconds_beside_whole_ones_are_the_clock(tmp_path, whole, part, scale, table):
     ticks = np.round(table.pop("Time [s]") * scale).astype(int)
     seconds = ticks // scale
     if whole == "Time":
@@ -873,7 +854,7 @@ def test_an_error_without_a_sure_channel_names_the_quantities_that_no_column_loo
         (fixes, r"a yaw rate \(yaw_rate\) or a lateral acceleration \(ay\)$"),
         (odometry, r"a lateral acceleration \(ay\)$"),
     ):
-        examined = inspect("my_car", [write(tmp_path / "lap.csv", table)])
+        examined = examine(tmp_path, table)
         with pytest.raises(ConfigurationError, match=f"; no column looks like {lacking}"):
             ask(examined, [], interactive=False)
 
@@ -881,7 +862,7 @@ def test_an_error_without_a_sure_channel_names_the_quantities_that_no_column_loo
 def test_an_error_without_a_sure_channel_names_what_was_not_read(tmp_path):
     d = drive(60.0)
     table = pd.DataFrame({"t": d["t"], "v": [f"{v:.3f} m/s" for v in d["vx"]], "r": d["r"]})
-    examined = inspect("my_car", [write(tmp_path / "lap.csv", table.assign(ay=d["ay"]))])
+    examined = examine(tmp_path, table.assign(ay=d["ay"]))
     with pytest.raises(ConfigurationError, match="column 'v' holds numbers with a unit"):
         ask(examined, [], interactive=False)
 
@@ -940,18 +921,17 @@ def test_a_measurement_of_raw_frames_is_refused_with_the_way_to_decode_them(tmp_
         survey(file)
 
 
-def signed_elsewhere(table, name, values):
-    """A table with a column of magnitudes and one of signs, 1 where negative."""
-    return table.assign(
-        **{f"ESP_{name}": np.abs(values), f"ESP_VZ_{name}": (values < 0).astype(int)}
-    )
+def signed_elsewhere(table):
+    """The table with the yaw rate as a column of magnitudes and one of signs, 1 where negative."""
+    yaw_rate = table["Gyro"]
+    signed = {"ESP_Gierrate": yaw_rate.abs(), "ESP_VZ_Gierrate": (yaw_rate < 0).astype(int)}
+    return table.drop(columns="Gyro").assign(**signed)
 
 
 @pytest.mark.parametrize("kind", ["table", "mdf"])
-def test_a_column_of_the_sign_beside_a_magnitude_gives_the_signed_value(tmp_path, kind):
-    table = usual(drive())
+def test_a_column_of_the_sign_beside_a_magnitude_gives_the_signed_value(tmp_path, kind, table):
     yaw_rate = table["Gyro"].to_numpy()
-    signed = signed_elsewhere(table.drop(columns="Gyro"), "Gierrate", yaw_rate)
+    signed = signed_elsewhere(table)
     file = tmp_path / "lap.csv"
     if kind == "table":
         write(file, signed)
@@ -971,9 +951,8 @@ def test_a_column_of_the_sign_beside_a_magnitude_gives_the_signed_value(tmp_path
     np.testing.assert_allclose(recording["yaw_rate"], np.radians(yaw_rate), atol=1e-5)
 
 
-def test_a_declared_sign_of_another_value_is_named_with_its_file_and_remedy(tmp_path):
-    table = usual(drive())
-    signed = signed_elsewhere(table.drop(columns="Gyro"), "Gierrate", table["Gyro"].to_numpy())
+def test_a_declared_sign_of_another_value_is_named_with_its_file_and_remedy(tmp_path, table):
+    signed = signed_elsewhere(table)
     log_draft, _ = read_back(write(tmp_path / "lap.csv", signed))
     signed["ESP_VZ_Gierrate"] *= -1
     file = write(tmp_path / "lap.csv", signed)
@@ -982,13 +961,12 @@ def test_a_declared_sign_of_another_value_is_named_with_its_file_and_remedy(tmp_
         open_source(log_draft.dataset).read("lap")
 
 
-def test_a_sign_of_other_values_than_0_and_1_is_left_out_with_its_magnitude(tmp_path):
-    table = usual(drive())
+def test_a_sign_of_other_values_than_0_and_1_is_left_out_with_its_magnitude(tmp_path, table):
     steering = 16.0 * np.degrees(drive()["r"])
     signed = table.assign(
         LWI_Lenkradwinkel=np.abs(steering), LWI_VZ_Lenkradwinkel=np.sign(steering)
     )
-    proposals = inspect("my_car", [write(tmp_path / "lap.csv", signed)]).proposals
+    proposals = examine(tmp_path, signed).proposals
     columns = {channel.column for channel in proposals.channels}
     assert not {"LWI_Lenkradwinkel", "LWI_VZ_Lenkradwinkel"} & columns
     (note,) = [note for note in proposals.notes if "'LWI_VZ_Lenkradwinkel' holds its sign" in note]

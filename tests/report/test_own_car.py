@@ -102,9 +102,7 @@ def test_share_that_is_scored_and_sideslip_hidden_in_the_start_of_a_range(part, 
     vx[round(84.0 * 20) : round(84.5 * 20)] = 0.0003
     vy[round(84.0 * 20) : round(84.5 * 20)] = 0.02
     file = tmp_path / "lap.parquet"
-    write_recording(
-        replace(recording, channels={**recording.channels, "vx": vx, "vy_ref": vy}), file
-    )
+    write_recording(recording.with_channels({"vx": vx, "vy_ref": vy}), file)
     words = verdict_text(
         replace(
             part,
@@ -173,9 +171,7 @@ def test_recordings_without_sideslip_cannot_rank(part, tmp_path):
     standstill = drive()
     file = tmp_path / "lap.parquet"
     write_recording(
-        replace(
-            standstill, channels={**standstill.channels, "vy_ref": 0.01 * standstill["vy_ref"]}
-        ),
+        standstill.with_channels({"vy_ref": 0.01 * standstill["vy_ref"]}),
         file,
     )
     verdict = verdict_of(replace(part, references={("toy", "lap"): file}), "test")

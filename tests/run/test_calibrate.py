@@ -78,7 +78,7 @@ def test_a_model_by_its_path_has_its_calibration_whatever_the_output_root(evalua
     lap = place.folder / "lap.csv"
     out = tmp_path / "estimate.csv"
     drive = planar_drive(20.0, 100.0).without_references()
-    pd.DataFrame({"time": drive.time, **drive.channels}).to_csv(lap, index=False)
+    drive.to_pandas().to_csv(lap)
     for name, folder in (
         ("here", place.folder / model),
         ("away", shutil.copytree(place.folder / model, tmp_path / "away")),
@@ -185,7 +185,7 @@ def test_a_damaged_calibration_is_an_error_and_not_a_model_without_bands(evaluat
     calibration = calibration_of(model, place.folder / "outputs").folder
     damage(calibration / name)
     drive = planar_drive(20.0, 100.0).without_references()
-    pd.DataFrame({"time": drive.time, **drive.channels}).to_csv("lap.csv", index=False)
+    drive.to_pandas().to_csv("lap.csv")
     place.refused("estimate", str(model), "lap.csv", "-o", "out.csv", says=str(calibration))
     assert not Path("out.csv").exists()
     calibration.rename(calibration.with_name(f"another-{calibration.name}"))

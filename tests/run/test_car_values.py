@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 import yaml
@@ -46,8 +45,8 @@ def write_dataset(name, **options):
 
 def write_lap(references=True):
     drive = planar_drive(30.0, 100.0, seed=4, noise=0.02)
-    channels = drive.channels if references else drive.without_references().channels
-    pd.DataFrame({"time": drive.time, **channels}).to_csv("lap.csv", index=False)
+    measured = drive if references else drive.without_references()
+    measured.to_pandas().to_csv("lap.csv")
 
 
 @pytest.fixture(scope="module")

@@ -417,7 +417,7 @@ def test_estimate_and_evaluation_refuse_unsuitable_recordings_and_replace_nothin
         "tracking=none",
     )
     drive = planar_drive(10.0, 20.0).without_references()
-    slow = pd.DataFrame({"time": drive.time, **drive.channels})
+    slow = drive.to_pandas().reset_index()
     for name, table in (
         ("slow", slow.iloc[::5]),
         ("less", slow.drop(columns="ax")),

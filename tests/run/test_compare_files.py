@@ -2,7 +2,6 @@
 
 import json
 import math
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,6 @@ from refusals import refusal
 from conftest import planar_drive
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.estimate import Estimate
-from vehest.data.recording import Recording
 from vehest.data.store import write_estimate
 from vehest.run.compare_files import compare_estimates, compare_files, named_by_estimator
 from vehest.run.estimate_tables import parse_columns, parse_shift, read_estimate_table
@@ -74,7 +72,7 @@ def test_an_angle_at_standstill_is_no_velocity_and_other_tools_have_an_angle_to_
     is_standing = drive.time > 110.0
     stopped = {"vx": 0.05, "vy_ref": 0.0, "yaw_rate": 0.0}
     channels = {name: np.where(is_standing, value, drive[name]) for name, value in stopped.items()}
-    stopped_drive = replace(drive, channels={**drive.channels, **channels})
+    stopped_drive = drive.with_channels(channels)
     beta = np.where(is_standing, np.radians(89.9), np.arctan2(drive["vy_ref"], drive["vx"]))
     file = tmp_path / "angle.csv"
     pd.DataFrame({"time": drive.time, "beta": beta}).to_csv(file, index=False)
@@ -89,7 +87,7 @@ def test_a_car_that_stands_for_a_while_makes_no_good_estimate_the_worst(drive, t
     stopped = {
         name: np.where(is_standing, 0.0, drive[name]) for name in ("vx", "vy_ref", "yaw_rate")
     }
-    stopped_drive = replace(drive, channels={**drive.channels, **stopped})
+    stopped_drive = drive.with_channels(stopped)
     estimate = read_estimate_table(written(tmp_path, "mine", stopped_drive, 0.02), stopped_drive)
     comparison = compare_estimates(stopped_drive, {"mine": estimate})
     assert comparison["rows"][0]["estimate"] == "mine"
@@ -101,7 +99,7 @@ def test_a_car_that_stands_for_a_while_makes_no_good_estimate_the_worst(drive, t
     ] == pytest.approx(1 / 3)
     standstill = {name: np.zeros(len(stopped_drive)) for name in ("vx", "vy_ref")}
     parked = compare_estimates(
-        replace(stopped_drive, channels={**stopped_drive.channels, **standstill}),
+        stopped_drive.with_channels(standstill),
         {"mine": estimate},
     )
     assert parked["share_below_min_speed"] == 1.0
@@ -245,13 +243,7 @@ def test_a_winner_is_named_only_above_the_baselines(drive, tmp_path):
 def test_the_static_map_knows_no_sample_that_it_is_judged_by(drive):
     """With lateral velocity turned in the second half, a map of the other half is wrong in both."""
     turned = np.where(drive.time < drive.start_time + 60.0, drive["vy_ref"], -drive["vy_ref"])
-    foreign = Recording(
-        drive.id,
-        drive.vehicle,
-        drive.rate_hz,
-        drive.start_time,
-        {**drive.channels, "vy_ref": turned},
-    )
+    foreign = drive.with_channels({"vy_ref": turned})
     estimate = Estimate(
         foreign.id,
         "true",
@@ -334,7 +326,7 @@ def test_shift_by_correlation_is_the_simulated_shift(drive, tmp_path, capsys, sh
 
 def test_a_shift_between_laps_that_resemble_each_other_is_refused(drive, tmp_path):
     lap = np.sin(2.0 * np.pi * drive.time / 12.0)
-    repeated = replace(drive, channels={**drive.channels, "vy_ref": lap})
+    repeated = drive.with_channels({"vy_ref": lap})
     file = tmp_path / "lap.csv"
     part = (drive.time >= drive.time[0] + 30.0) & (drive.time < drive.time[0] + 60.0)
     pd.DataFrame({"time": drive.time[part], "vy": lap[part]}).to_csv(file, index=False)

@@ -48,9 +48,7 @@ def saved(place, model):
 def lap(changes=None):
     """Write lap.csv: a drive with some of its channels replaced."""
     drive = drive_of(4).without_references()
-    pd.DataFrame({"time": drive.time, **drive.channels, **(changes or {})}).to_csv(
-        "lap.csv", index=False
-    )
+    drive.to_pandas().assign(**(changes or {})).to_csv("lap.csv")
 
 
 def test_the_stated_range_of_sideslip_leaves_out_standstill_and_reverse(saved):
@@ -237,7 +235,7 @@ def calibrated_model(name):
 @pytest.mark.parametrize("name", estimator_names())
 def test_every_family_estimates_a_file_in_parts_like_the_full_file(place, monkeypatch, name):
     folder, drive = calibrated_model(name)
-    pd.DataFrame({"time": drive.time, **drive.channels}).to_parquet("drive.parquet")
+    drive.to_pandas().reset_index().to_parquet("drive.parquet")
     command = [str(folder), "drive.parquet", "dataset.accept=[sign,unit,impossible]"]
     estimate_file(command, Path("whole.parquet"))
     in_parts(monkeypatch, 1.3)

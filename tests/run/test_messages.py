@@ -231,7 +231,7 @@ def test_every_stage_of_a_training_is_announced_and_ended(place, events):
 
 def test_files_whose_names_are_not_utf_8_are_read_and_written(place):
     drive = planar_drive(20.0, 100.0).without_references()
-    pd.DataFrame({"time": drive.time, **drive.channels}).to_csv("lap.csv", index=False)
+    drive.to_pandas().to_csv("lap.csv")
     lap = os.fsdecode(b"lap\xff.csv")
     Path("lap.csv").rename(lap)
     assert place("data", "check", lap)[:2] == (0, "no findings\n")
@@ -361,7 +361,7 @@ def test_a_full_disk_names_its_target_in_every_stage_and_leaves_nothing(place):
     )
     place.change("pipelines/small.yaml", sweeps=[[trained[0], *trained[2:4]]])
     drive = planar_drive(30.0, 100.0)
-    pd.DataFrame({"time": drive.time, **drive.channels}).to_csv("lap.csv", index=False)
+    drive.to_pandas().to_csv("lap.csv")
     stages = (
         (10_000, "ingest", ("ingest", "mine")),
         *((10_000, "downsample", ("downsample", "mine", f"rate_hz={rate}")) for rate in (100, 20)),

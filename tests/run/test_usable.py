@@ -13,6 +13,7 @@ import yaml
 
 from conftest import planar_drive
 from place import DATASET
+from single_track_drive import with_gaps
 from vehest.configuration.composition import compose_config
 from vehest.data.derivable_channels import MAKES, derivation_of
 from vehest.data.derived import WHEELS
@@ -80,9 +81,7 @@ def add_logged(place, channels, rate_hz=50.0, **options):
     (place.folder / "raw" / "logged").mkdir()
     for seed in (1, 2, 3):
         lap = log(channels, rate_hz, seed)
-        pd.DataFrame({"t": lap.time, **lap.channels}).to_csv(
-            place.folder / "raw" / "logged" / f"lap{seed}.csv", index=False
-        )
+        lap.to_pandas().to_csv(place.folder / "raw" / "logged" / f"lap{seed}.csv", index_label="t")
     declared = {name: {"column": name, "unit": UNITS[name]} for name in sorted(channels)}
     entry = {
         "name": "logged",
@@ -285,8 +284,7 @@ def test_missing_references_gaps_and_channels_are_named_by_estimator():
         "they learn nothing of a reference"
     )
     drive = log(FULL)
-    ay = np.where(np.arange(len(drive)) == 10, np.nan, drive["ay"])
-    table = rows(replace(drive, channels={**drive.channels, "ay": ay}, gappy=frozenset({"ay"})))
+    table = rows(with_gaps(drive, {"ay": 10}))
     assert (table["ksnn"]["gaps"], table["kalman"]["gaps"]) == (["ay"], []), (
         "the filter skips a sample of ay"
     )
@@ -363,9 +361,8 @@ def test_the_self_calibrating_filter_is_offered_without_ax_not_with_one_of_the_s
 
 
 def test_bare_files_are_assessed_by_their_columns(place):
-    lap = log({"vx", "yaw_rate", "ay"})
-    table = pd.DataFrame({"time": lap.time, **lap.channels, "AccX": 0.0, "Steering": 0.0})
-    table.to_csv("lap.csv", index=False)
+    table = log({"vx", "yaw_rate", "ay"}).to_pandas()
+    table.assign(AccX=0.0, Steering=0.0).to_csv("lap.csv")
     assert place.told("data", "usable", "lap.csv")["unused_columns"] == ["AccX", "Steering"]
     assert "columns without a channel: AccX, Steering" in place("data", "usable", "lap.csv")[1]
     assert place("data", "usable", "nowhere.csv")[0] == 4

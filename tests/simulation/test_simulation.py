@@ -42,14 +42,14 @@ def drive(seed, duration=12.0, **options):
     )
 
 
-def trip(seed, course="handling", surface="dry", step=0.001, rate_hz=100.0, **options):
+def trip(seed, course="handling", surface="dry", step=0.001, **options):
     manoeuvre = manoeuvre_from_config({"name": "laps", "course": course, **options})
     return drive_plant(
         MultiBodyPlant(LOWERED, step),
         manoeuvre,
         seed,
         surface=surface_from_config(surface),
-        rate_hz=rate_hz,
+        rate_hz=100.0,
     )
 
 

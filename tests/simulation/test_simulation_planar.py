@@ -56,8 +56,8 @@ def coasted(car, seconds, speed=0.0, **inputs):
 
 
 @cache
-def freestyle(seed=1, rate_hz=1000.0):
-    return drive_freely(PlanarPlant(CAR), Freestyle(duration=15.0), seed, rate_hz=rate_hz).motion
+def freestyle(rate_hz=1000.0):
+    return drive_freely(PlanarPlant(CAR), Freestyle(duration=15.0), 1, rate_hz=rate_hz).motion
 
 
 def test_slow_motors_and_locked_wheels_have_the_forces_of_the_closed_form():

@@ -32,11 +32,11 @@ def ramp_of(name):
     return ramp_steer(plant_of(name), 20.0 if name == "heavy_truck" else 25.0)
 
 
-def steady_turn(plant, speed, steer, seconds=8.0):
+def steady_turn(plant, speed, steer):
     """The last moment of a turn at constant speed and steering angle, as a motion of one sample."""
     state = rolling(plant, speed)
     integral = 0.0
-    for _ in range(round(100 * seconds)):
+    for _ in range(800):
         error = speed - state.vx
         integral += 0.01 * error
         inputs = inputs_of(

@@ -315,11 +315,11 @@ def test_what_new_cannot_do_with_a_dbc_is_one_line(tmp_path, names, message):
     assert message in refusal(lambda: inspect("my_car", files), VehestError)
 
 
-def ramp(first, missing, n=200):
+def ramp(missing):
     """Frames of 100 Hz whose first two bytes count up, but for a missing code from sample 20."""
     return [
         (k / 100, 0, struct.pack("<H6x", missing[k - 20] if 20 <= k < 20 + len(missing) else k))
-        for k in range(first, first + n)
+        for k in range(200)
     ]
 
 
@@ -335,7 +335,7 @@ def recordings(folder, **options):
 
 @pytest.mark.parametrize("name", ["SNA", "Speed_Invalid", "ERROR", "Init", "n.a."])
 def test_values_that_the_dbc_names_not_available_are_missing_samples(tmp_path, name):
-    log(tmp_path, choices(f'65535 "{name}"'), ramp(0, [65535] * 5))
+    log(tmp_path, choices(f'65535 "{name}"'), ramp([65535] * 5))
     recording = read(tmp_path, channels={"vx": {**SPEED["vx"], "max_gap": 0.1}})
     np.testing.assert_allclose(recording["vx"], np.arange(len(recording)) / 100.0, atol=1e-9)
     parts = recordings(tmp_path)
@@ -353,7 +353,7 @@ def test_values_that_the_dbc_names_not_available_are_missing_samples(tmp_path, n
 
 @pytest.mark.parametrize("encoding", ["cp1252", "utf-8", "utf-8-sig"])
 def test_names_of_values_match_in_the_encodings_of_dbc_files(tmp_path, encoding):
-    log(tmp_path, "", ramp(0, [65535] * 5))
+    log(tmp_path, "", ramp([65535] * 5))
     content = choices('65535 "Ungültig"').replace("m/s", "km/h").encode(encoding)
     (tmp_path / "car.dbc").write_bytes(content)
     speed = {**SPEED["vx"], "unit": "km/h", "max_gap": 0.1}
@@ -362,7 +362,7 @@ def test_names_of_values_match_in_the_encodings_of_dbc_files(tmp_path, encoding)
 
 
 def test_long_missing_samples_end_a_recording_where_the_data_set_has_a_max_gap(tmp_path):
-    log(tmp_path, choices('65535 "SNA"'), ramp(0, [65535] * 50))
+    log(tmp_path, choices('65535 "SNA"'), ramp([65535] * 50))
     parts = recordings(tmp_path, max_gap=0.1)
     assert [(len(part), float(part["vx"].max())) for part in parts] == [(20, 0.19), (130, 1.99)]
 
@@ -371,7 +371,7 @@ def test_long_missing_samples_end_a_recording_where_the_data_set_has_a_max_gap(t
     "names", ['0 "Init"', '30 "Errors occurred once"', '30 "valid"', '30 "N" 31 "Normal"']
 )
 def test_values_with_other_names_and_the_zero_of_a_standing_car_are_measurements(tmp_path, names):
-    log(tmp_path, choices(names), ramp(0, []))
+    log(tmp_path, choices(names), ramp([]))
     recording = read(tmp_path, channels=SPEED)
     np.testing.assert_allclose(recording["vx"], np.arange(len(recording)) / 100.0, atol=1e-9)
 
@@ -407,7 +407,7 @@ def test_reserved_codes_of_j1939_are_missing_samples(tmp_path, maximum, protocol
 
 
 def test_data_check_names_missing_samples_and_goes_on_with_the_segments(tmp_path, monkeypatch):
-    log(tmp_path, choices('65535 "SNA"'), [*ramp(0, [65535] * 5), (2.0, 0, b"\x00\xf0" + bytes(6))])
+    log(tmp_path, choices('65535 "SNA"'), [*ramp([65535] * 5), (2.0, 0, b"\x00\xf0" + bytes(6))])
     text = f"""
 name: mine
 title: ""

@@ -35,15 +35,13 @@ def refused(file):
     return message
 
 
-def overwritten(file, block, block_index, offset, layout, value):
+def overwritten(file, block, offset, value):
     """Overwrite a number behind a block's head of 24 bytes; None stands for the block's own
     address.
     """
     content = bytearray(file.read_bytes())
-    place = -1
-    for _ in range(block_index + 1):
-        place = content.index(block, place + 1)
-    struct.pack_into(layout, content, place + 24 + offset, place if value is None else value)
+    place = content.index(block)
+    struct.pack_into("<Q", content, place + 24 + offset, place if value is None else value)
     file.write_bytes(content)
     return file
 
@@ -173,7 +171,7 @@ def test_a_conversion_that_leads_elsewhere_is_not_left_out(tmp_path, version):
 @pytest.mark.parametrize(("block", "link"), [(b"##DG", 0), (b"##CN", 1)])
 def test_a_chain_that_leads_back_ends_in_one_line(tmp_path, block, link, monkeypatch):
     monkeypatch.setattr("vehest.sources.limited.SECONDS", 1.0)
-    assert refused(overwritten(written(tmp_path / "a.mf4"), block, 0, 8 * link, "<Q", None))
+    assert refused(overwritten(written(tmp_path / "a.mf4"), block, 8 * link, None))
 
 
 def test_a_packed_block_beyond_the_memory_ends_in_one_line(tmp_path):
@@ -190,7 +188,7 @@ def test_a_packed_block_beyond_the_memory_ends_in_one_line(tmp_path):
     )
     file.write_bytes(moved + head + packed)
     with use_limits(Limits(memory=400_000_000)):
-        assert refused(overwritten(file, b"##CG", 0, 56, "<Q", 400 * 2**20 // 24))  # bytes a record
+        assert refused(overwritten(file, b"##CG", 56, 400 * 2**20 // 24))  # bytes a record
 
 
 def test_samples_that_are_not_there_or_beyond_the_limit_are_not_made_and_a_pipe_is_not_waited_for(
@@ -200,7 +198,7 @@ def test_samples_that_are_not_there_or_beyond_the_limit_are_not_made_and_a_pipe_
     with use_limits(Limits(samples=2000)):
         assert "raise it: limits.samples=NUMBER" in refused(file)
     for samples in (10**7, 2**64 - 1):
-        message = refused(overwritten(file, b"##CG", 0, 56, "<Q", samples))
+        message = refused(overwritten(file, b"##CG", 56, samples))
         assert "its header says" in message or "limits.samples" in message
     os.mkfifo(tmp_path / "pipe.mf4")
     assert "is a pipe, not a file" in refusal(lambda: read_measurement(tmp_path / "pipe.mf4", {}))

@@ -37,7 +37,7 @@ def test_health_on_the_page_flags_a_frozen_channel_from_its_onset_on(tmp_path):
     drive = measured_drive(3)
     yaw_rate = np.array(drive["yaw_rate"])
     yaw_rate[drive.time >= FROZEN] = yaw_rate[drive.time >= FROZEN][0]
-    drive = replace(drive, channels={**drive.channels, "yaw_rate": yaw_rate})
+    drive = drive.with_channels({"yaw_rate": yaw_rate})
     part, model = comparison_on(drive, tmp_path, RATE)
     health = health_over(model, list(pieces_of(SPANS, lambda span: drive, part.protocol)), part, 5)
     lengths = [round((span.stop - span.start - 1.5) * RATE) for span in SPANS]

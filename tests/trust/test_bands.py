@@ -60,8 +60,8 @@ def piece_of(rng, n, deviation=0.1, variance=math.nan):
     )
 
 
-def bands_of(seed=0, **changes):
-    rng = np.random.default_rng(seed)
+def bands_of(**changes):
+    rng = np.random.default_rng(0)
     return calibrated(
         [piece_of(rng, 6000, **changes)], [piece_of(rng, 4000, **changes)], CHANNELS, **ORIGIN
     )

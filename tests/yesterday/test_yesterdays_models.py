@@ -57,7 +57,7 @@ def test_the_command_gives_the_same(tmp_path, monkeypatch, capsys):
     model = load_model(folder)
     drive = read_recording(FOLDER / "drives" / drive_name(model))
     monkeypatch.chdir(tmp_path)
-    pd.DataFrame({"time": drive.time, **drive.channels}).to_csv("lap.csv", index=False)
+    drive.to_pandas().to_csv("lap.csv")
     code, out, err = run_vehest(
         capsys, "estimate", str(folder), "lap.csv", "-o", "out.parquet", "--json"
     )
