@@ -506,7 +506,7 @@ def _baseline_in_place(claim: Claim, level: float, blocks: Mapping[Key, BlockErr
         return ""
     key, key_of_other = keys_of(claim)
     for name in BASELINES:
-        errors = blocks.get(key._replace(candidate=name))
+        errors = blocks.get(Key(key.part, name, key.test_set, key.metric))
         if name in claim.names or errors is None:
             continue
         subject = f"claim {claim.id!r}, baseline {name}"
