@@ -144,7 +144,7 @@ def figure_7(
             axes.minorticks_off()
             axes.set_title(SETS[test], loc="left")
             axes.set_xlabel("samples of a training sequence")
-            axes.set_ylim(bottom=0.0)
+            axes.set_yscale("log")
         grid[0].set_ylabel("MSE (weighted)")
         legend_above(figure, grid[0])
     seeds = listed([str(number) for number in sorted({length.n_seeds for length in trained})])
