@@ -27,9 +27,12 @@ MIN_SLIP_SHARE = 3.0 * MAX_UNEXPLAINED
 """Smallest share of the power of ax that -vy·yaw_rate has in a drive that can tell, with vy as
 large as at a point 1 m from one that does not slip.
 """
-SOURCES = {"ax": ("d(vx)", "d(vx_ref)"), "ay": ("turning",)}
+SOURCES = {
+    "ax": {"d(vx)": "d(vx)/dt", "d(vx_ref)": "d(vx_ref)/dt"},
+    "ay": {"turning": "vx·yaw_rate"},
+}
 """Acceleration -> signals of `vehest.alignment.delays.signals_to_compare` of which it may be
-computed.
+computed -> text.
 """
 
 
@@ -55,11 +58,10 @@ def computed_channels(motion: Motion, spectra: CrossSpectra) -> dict[str, str]:
     ax = motion["ax"][motion.moving]
     if np.mean(np.square(turning)) < MIN_SLIP_SHARE * np.var(ax):
         return {}
-    texts = {"d(vx)": "d(vx)/dt", "d(vx_ref)": "d(vx_ref)/dt", "turning": "vx·yaw_rate"}
     return {
-        channel: texts[source]
+        channel: text
         for channel, sources in SOURCES.items()
-        for source in sources
+        for source, text in sources.items()
         if _is_computed(spectra, source, channel)
     }
 

@@ -485,9 +485,9 @@ class _Report:
     def verdict(self) -> str:
         """One line on the share of valid samples and on what makes others invalid."""
         if self.health is None:
-            bands = "no band" if "band_vy" not in self.last.channels else "its bands are its own"
             if self.has_calibrated_bands:
-                return "health is not calibrated for these channels: from gaps and speeds alone"
+                return "health is from gaps and speeds alone: not calibrated for these channels"
+            bands = "its bands are its own" if "band_vy" in self.last.channels else "no band"
             return f"this model has no calibration: {bands}, and health from gaps and speeds alone"
         reasons = self.invalid_reasons
         valid = f"valid in {self.valid_percent:.3g} % of the drive" + (
