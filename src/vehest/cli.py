@@ -231,8 +231,8 @@ def new_car(
     Proposes for every column channel, unit, sign and delay, with its evidence, asks where the logs
     do not decide, and writes conf/dataset, conf/split and pipelines/my_car.yaml; where the logs
     have no reference, conf/dataset alone, and the command that estimates without one. Reads tables,
-    Parquet, MDF, VBO, ROS 2 bags, and logs of a CAN bus with their DBC: `vehest new my_car
-    drive.blf car.dbc`. With --json nothing is asked.
+    Parquet, MATLAB's .mat, MDF, VBO, ROS 2 bags, and logs of a CAN bus with their DBC: `vehest new
+    my_car drive.blf car.dbc`. With --json nothing is asked.
     """
     require_paths(files)
     from vehest.run.console import Messages
@@ -1119,7 +1119,10 @@ def data_channels(as_json: AsJson = False) -> None:
 @data_app.command("show")
 def data_show(
     source: Annotated[
-        str, typer.Argument(help="A data set, or a CSV or Parquet file.", autocompletion=DATASETS)
+        str,
+        typer.Argument(
+            help="A data set, or a table (CSV, Parquet, .mat).", autocompletion=DATASETS
+        ),
     ],
     overrides: Overrides = None,
     as_json: AsJson = False,
@@ -1167,7 +1170,10 @@ def data_usable(
 @data_app.command("align")
 def data_align(
     source: Annotated[
-        str, typer.Argument(help="A data set, or a CSV or Parquet file.", autocompletion=DATASETS)
+        str,
+        typer.Argument(
+            help="A data set, or a table (CSV, Parquet, .mat).", autocompletion=DATASETS
+        ),
     ],
     overrides: Overrides = None,
     estimate: Annotated[

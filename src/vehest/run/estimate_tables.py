@@ -27,7 +27,7 @@ from vehest.run.time_shift import Series, estimate_shift
 from vehest.sources.base import read_single
 from vehest.sources.named_columns import NamedColumn, written_unit
 from vehest.sources.surveys.tables import shape_of, unit_in_name
-from vehest.sources.tables import TextLayout, column_names, is_parquet
+from vehest.sources.tables import TextLayout, column_names, is_parquet, is_text
 from vehest.sources.unit_spellings import plain_unit
 
 CHANNELS_OF_QUANTITIES = {"time": "time", "vy": "vy_ref", "sideslip": "sideslip_ref"}
@@ -125,7 +125,7 @@ def read_estimate_table(
     Parameters
     ----------
     file : Path
-        CSV or Parquet. An estimate of ``vehest estimate`` in Parquet is read as it is.
+        CSV, Parquet or MATLAB's. An estimate of ``vehest estimate`` in Parquet is read as it is.
     drive : Recording
         That was estimated.
     columns : sequence of NamedColumn
@@ -199,7 +199,7 @@ def names_of_table(file: Path) -> list[str]:
 
 def _layout(file: Path) -> TextLayout:
     """Delimiter, decimal mark, encoding and lines beside the rows of a table of text."""
-    return TextLayout() if is_parquet(file) else shape_of(file).layout
+    return shape_of(file).layout if is_text(file) else TextLayout()
 
 
 def _columns_of(

@@ -12,14 +12,14 @@ from vehest.data.parquet import ROWS_AT_A_TIME
 from vehest.data.recording import part_slices
 from vehest.sources.clocks import Clock, even_clock
 from vehest.sources.table_rows import TimeColumn
-from vehest.sources.tables import TextLayout, column_parts, is_parquet
+from vehest.sources.tables import TextLayout, column_parts, is_parquet, is_text
 
 LARGE = 1 << 25  # smallest size of a table of text that is read in parts [bytes]
 
 
 def is_large(file: Path) -> bool:
     """Whether a table is Parquet, or of so much text that it is worth reading it in parts."""
-    return is_parquet(file) or file.stat().st_size >= LARGE
+    return is_parquet(file) or (is_text(file) and file.stat().st_size >= LARGE)
 
 
 def even_parts(

@@ -1,6 +1,6 @@
-"""Reads columns of numbers from tables of text (CSV) and Parquet.
+"""Reads columns of numbers from tables: of text (CSV), Parquet and MATLAB's files.
 
-file -> names of its columns -> pyarrow -> columns of float64
+file -> names of its columns -> pyarrow or scipy -> columns of float64
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from vehest.data.limits import check_limit, check_unpacked, current_limits
 from vehest.data.parquet import DAMAGE, number_batches, numbers_of, parquet_file, read_numbers
 from vehest.data.text_files import first_line
 from vehest.sources.clock_times import seconds_of_text
+from vehest.sources.matlab import is_matlab, mat_contents, read_mat
 
 BLOCK = 1 << 20  # largest length of a line that pyarrow reads [bytes]
 TAIL = 1 << 16  # bytes at the end of the rows that hold the last ones
@@ -67,6 +68,11 @@ def is_parquet(file: Path) -> bool:
     return file.suffix.lower() in {".parquet", ".pq"}
 
 
+def is_text(file: Path) -> bool:
+    """Whether a table is text, perhaps packed: neither Parquet nor MATLAB's."""
+    return not (is_parquet(file) or is_matlab(file))
+
+
 def column_names(file: Path, layout: TextLayout = TextLayout()) -> list[str]:
     """Names of a table's columns, in order.
 
@@ -85,6 +91,8 @@ def column_names(file: Path, layout: TextLayout = TextLayout()) -> list[str]:
     elif is_parquet(file):
         with parquet_file(file) as table:
             names = list(table.schema_arrow.names)
+    elif is_matlab(file):
+        names = list(mat_contents(file).lengths)
     else:
         names = names_of(*_first_rows(file, layout))
     check_limit("columns", len(names), f"'{file}' has {len(names)} columns")
@@ -138,7 +146,7 @@ def names_of(header: Sequence[str], first_row: Sequence[str]) -> list[str]:
 
 def with_names(file: Path, layout: TextLayout) -> TextLayout:
     """A layout with the names of the columns, where the file's line of names is not as read."""
-    if layout.names is not None or is_parquet(file):
+    if layout.names is not None or not is_text(file):
         return layout
     names = column_names(file, layout)
     if names == _first_rows(file, layout)[0]:
@@ -213,7 +221,7 @@ def read_columns(
     Parameters
     ----------
     file : Path
-        Table of text, perhaps packed, or Parquet.
+        Table of text, perhaps packed, Parquet or MATLAB's.
     selected : sequence of str
         Names of the wanted columns; others are not converted.
     layout : TextLayout
@@ -238,6 +246,8 @@ def read_columns(
     if is_parquet(file):
         with parquet_file(file) as parquet:
             return read_numbers(file, parquet, selected)
+    if is_matlab(file):
+        return read_mat(file, selected)
     opened = partial(pa.BufferReader, text)
     if text is None:
         opened = partial(table_stream, file, layout.n_bytes)
@@ -441,7 +451,7 @@ def cut_end(file: Path, layout: TextLayout) -> tuple[int, str] | None:
     that has fewer cells than the row above or ends within a number, or both; else a `_footer`.
     None where the table is complete, packed or in UTF-16.
     """
-    if is_parquet(file) or file.suffix.lower() in PACKED or layout.encoding.startswith("utf-16"):
+    if not is_text(file) or file.suffix.lower() in PACKED or layout.encoding.startswith("utf-16"):
         return None
     with open(regular_file(file), "rb") as stream:
         size = end = stream.seek(0, os.SEEK_END)

@@ -3,6 +3,7 @@
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from scipy.io import savemat
 
 from conftest import planar_drive
 from fuzz.case import Command, generator
@@ -74,6 +75,22 @@ def parquet(case):
         )
         case.spoil(file, spoil_bytes)
     return _reads(case, "lap.parquet")
+
+
+@generator(weight=4)
+def matlab(case):
+    """Bytes of a file of MATLAB's, and zeros that pack to next to nothing."""
+    file = case.place / "lap.mat"
+    if case.idea(4) == 0:
+        zeros = np.zeros(case.rng.choice([10**6, 10**7]))
+        savemat(file, dict.fromkeys(("time", "vx", "yaw_rate"), zeros), do_compression=True)
+    else:
+        table = lap(9, 20.0)
+        columns = {name: table[name].to_numpy() for name in table}
+        content = case.rng.choice([columns, {"lap": columns}])
+        savemat(file, content, do_compression=case.rng.random() < 0.5)
+        case.spoil(file, spoil_bytes)
+    return _reads(case, "lap.mat")
 
 
 @generator(weight=4)

@@ -33,6 +33,7 @@ from vehest.sources.clocks import INTERPOLATED_TOLERANCE, bridged, plain_rate, t
 from vehest.sources.columns import signed
 from vehest.sources.surveys import Log, survey
 from vehest.sources.surveys.clocks import STATED_UNITS, between_pauses
+from vehest.sources.tables import is_text
 from vehest.sources.unit_spellings import plain_unit
 
 # Hz, highest rate of the samples that proposals rest on; faster ones are averaged
@@ -49,7 +50,7 @@ MAX_COMPARED_ROWS = 4_000
 USUAL_STEP_QUANTILE = 0.99  # quantile of a velocity's |steps|, above which rows are not compared
 # |correlation| with these steps, above which a column is their difference
 MIN_DIFFERENCE_CORRELATION = 0.999
-TABLES = ("tabular", "text_log")  # sources of tables of text or Parquet
+TABLES = ("tabular", "text_log")  # sources of tables: text, Parquet and MATLAB's
 DBC = ".dbc"  # suffix of a description of a CAN bus
 LAYOUT = {
     "delimiter": ",",
@@ -368,12 +369,7 @@ def _longest(logs: Sequence[Log]) -> Log:
     """The longest log, with options that suit all of them; raises an error where formats or layouts
     differ.
     """
-    formats = {
-        "text"
-        if log.source in TABLES and log.file.suffix.lower() not in (".parquet", ".pq")
-        else log.source
-        for log in logs
-    }
+    formats = {"text" if log.source in TABLES and is_text(log.file) else log.source for log in logs}
     if len(formats) > 1:
         raise ConfigurationError(
             f"the files are of several formats ({', '.join(sorted(formats))}); create a data set "

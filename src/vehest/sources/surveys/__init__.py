@@ -125,11 +125,6 @@ def _survey(path: Path) -> Log:
     asks for.
     """
     ending = path.suffix.lower()
-    if ending == ".mat":
-        raise DataError(
-            f"'{path}' is MATLAB's; save its channels as columns of a table, in MATLAB by "
-            f"writetable(struct2table(load('{path.name}')), '{path.stem}.csv')"
-        )
     if ending in CAN:
         raise DataError(
             f"'{path}' is a log of a CAN bus; name the DBC file of the bus behind it, as in: "

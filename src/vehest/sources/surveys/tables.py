@@ -1,5 +1,5 @@
-"""Tables of text and Parquet: delimiter, decimal mark, encoding, lines before the names, a row of
-units below them.
+"""Tables of text, Parquet and MATLAB's: delimiter, decimal mark, encoding, lines before the names,
+a row of units below them.
 
 file -> its first lines -> the `Shape` that explains most of them -> pyarrow -> columns of numbers
 and clock times -> `Log`
@@ -36,6 +36,7 @@ from vehest.data.parquet import (
 )
 from vehest.data.text_files import first_line
 from vehest.sources.clock_times import past_midnight, seconds_of_text
+from vehest.sources.matlab import MatContents, is_matlab, mat_contents, read_mat
 from vehest.sources.not_measured import marks_not_measured
 from vehest.sources.surveys.clocks import (
     MAX_APART,
@@ -162,7 +163,7 @@ class Shape:
 
 
 def survey_table(file: Path) -> Log:
-    """Columns, clock and layout of a table of text, or of Parquet.
+    """Columns, clock and layout of a table of text, of Parquet or of MATLAB's.
 
     The source is ``text_log`` where ``tabular`` cannot read it: with rows below the names, marks of
     missing samples, or clock times.
@@ -195,6 +196,12 @@ def survey_table(file: Path) -> Log:
             skipped = [_unread_column(field) for field in others]
             check_limit("columns", len(names), f"'{file}' has {len(names)} columns")
             values = read_numbers(file, table, names)
+    elif is_matlab(file):
+        contents = mat_contents(file)
+        names = [name for name, size in contents.lengths.items() if size == contents.n_rows]
+        skipped = _of_other_lengths(contents)
+        units = dict(contents.units)
+        values = read_mat(file, names)
     else:
         shape = shape_of(file)
         table, skipped = _table(file, shape)
@@ -301,6 +308,24 @@ def _unread_column(field: pa.Field) -> str:
     if pa.types.is_nested(field.type):
         return f"{text}; make a column of each of its elements (in pandas: .str[0], .str[1] …)"
     return text
+
+
+def _of_other_lengths(contents: MatContents) -> list[str]:
+    """Texts on what is not read of MATLAB's files: among it columns of another number of samples
+    than most have.
+    """
+    others: dict[int, list[str]] = {}
+    for name, size in contents.lengths.items():
+        if size != contents.n_rows:
+            others.setdefault(size, []).append(name)
+    return [
+        *contents.skipped,
+        *(
+            f"{listed(names)}, of {size} samples instead of {contents.n_rows}; resample to one "
+            "rate what is needed, for example in MATLAB by interp1"
+            for size, names in others.items()
+        ),
+    ]
 
 
 def _require_rows_once(
