@@ -416,6 +416,25 @@ def test_a_reference_is_made_of_positions_and_yaw_where_there_is_no_other(tmp_pa
     assert np.corrcoef(read_back(log_draft)["vy_ref"], d["vy"])[0, 1] > 0.9
 
 
+def test_values_of_wrongly_decoded_frames_do_not_hide_a_channel(tmp_path):
+    """As in the KTH's VBOX logs: 0.6 % of a steering wheel's angle and of a speed are ±27,900."""
+    d = drive()
+    table = usual(d)
+    rows = np.random.default_rng(3).choice(len(d["t"]), round(0.003 * len(d["t"])), replace=False)
+    for column in ("Steer", "Speed"):
+        values = table[column].to_numpy(copy=True)
+        values[rows] = 27899.08
+        values[rows + 1 - 2 * (rows == len(values) - 1)] = -13608.92
+        table[column] = values
+    log_draft = drafted(tmp_path, table)
+    channels = log_draft.dataset["channels"]
+    assert channels["handwheel"] == {"column": "Steer", "unit": "deg"}
+    assert channels["vx"] == {"column": "Speed", "unit": "km/h"}
+    recording = read_back(log_draft)
+    assert np.corrcoef(recording["handwheel"], d["handwheel"])[0, 1] > 0.99
+    assert np.abs(recording["vx"] - d["vx"]).max() < 1.0
+
+
 @pytest.mark.parametrize(
     ("name", "content", "message_part"),
     [

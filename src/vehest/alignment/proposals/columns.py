@@ -15,6 +15,7 @@ from vehest.alignment.proposals.names import WEAK, bare, hints, is_of_bus, is_re
 from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
 from vehest.data.errors import DataError
+from vehest.data.runs import true_runs
 from vehest.data.units import factor_to_si
 
 # Hz, cut-off of low-passed columns; below it, a delay of a tenth of a second and vibration matter
@@ -27,6 +28,10 @@ MAX_MISSING_SHARE = 0.5  # largest share of missing samples of a column, which a
 STRAY_DISTANCE = 20.0  # smallest distance of a stray sample, over the spread of nearly all samples
 # largest share of stray samples; where more lie far outside, none counts as stray
 MAX_STRAY_SHARE = 0.002
+# the same of stray samples that come and go, such as of frames that were decoded wrongly
+BRIEF_DISTANCE = 3.0
+MAX_BRIEF_SHARE = 0.01
+MAX_BRIEF_SAMPLES = 5  # largest number of such samples after one another
 # number of samples above which a column that never decreases is a clock, unless it is named as a
 # position
 MIN_CLOCK_SAMPLES = 1000
@@ -218,7 +223,7 @@ def candidates(
             only_grows and not {"latitude", "longitude", "position_x", "position_y"} & set(roles)
         ):
             continue
-        is_measured[is_measured] = ~_stray(values[is_measured])
+        is_measured[is_measured] = ~stray_samples(values[is_measured])
         if not is_measured.all():
             rows = np.flatnonzero(is_measured)
             values = np.interp(np.arange(len(values)), rows, values[rows])
@@ -251,11 +256,24 @@ def without_axes(columns: Sequence[Candidate]) -> list[Candidate]:
     return [changed.get(column.name, column) for column in columns]
 
 
-def _stray(values: FloatArray) -> NDArray[np.bool_]:
-    """Samples that lie far outside of nearly all others, (T,); none where they are not few."""
-    low, middle, high = np.quantile(values, [MAX_STRAY_SHARE, 0.5, 1.0 - MAX_STRAY_SHARE])
-    stray = np.abs(values - middle) > STRAY_DISTANCE * max(high - low, 1e-300)
-    return stray if stray.mean() <= MAX_STRAY_SHARE else np.zeros(len(values), dtype=bool)
+def stray_samples(values: FloatArray) -> NDArray[np.bool_]:
+    """Samples that lie far outside of nearly all others, (T,); none where they are not few.
+
+    Those that come and go within `MAX_BRIEF_SAMPLES` may be nearer, and more.
+    """
+    brief = _outside(values, BRIEF_DISTANCE, MAX_BRIEF_SHARE)
+    for begin, end in true_runs(brief):
+        brief[begin:end] = end - begin <= MAX_BRIEF_SAMPLES
+    return brief | _outside(values, STRAY_DISTANCE, MAX_STRAY_SHARE)
+
+
+def _outside(values: FloatArray, distance: float, max_share: float) -> NDArray[np.bool_]:
+    """Samples further from the median than ``distance`` times the spread of all but ``max_share`` at
+    either end, (T,); none where they are more than that share.
+    """
+    low, middle, high = np.quantile(values, [max_share, 0.5, 1.0 - max_share])
+    outside = np.abs(values - middle) > distance * max(high - low, 1e-300)
+    return outside if outside.mean() <= max_share else np.zeros(len(values), dtype=bool)
 
 
 def slow_of(values: FloatArray, rate_hz: float) -> FloatArray:

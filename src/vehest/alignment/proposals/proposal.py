@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vehest.alignment.proposals.columns import stray_samples
 from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
 from vehest.data.units import factor_to_si
@@ -71,7 +72,7 @@ class Proposal:
         return plain
 
     def is_impossible(self, values: FloatArray) -> NDArray[np.bool_]:
-        """Whether values of the column are such as no vehicle can have, (T,).
+        """Whether values of the column are such as no vehicle can have, (T,), stray ones apart.
 
         Parameters
         ----------
@@ -80,7 +81,11 @@ class Proposal:
         """
         channel = CHANNELS[self.channel]
         samples = self.si(values)
-        return np.asarray((samples < channel.low) | (samples > channel.high))
+        impossible = (samples < channel.low) | (samples > channel.high)
+        if impossible.any():
+            measured = np.isfinite(samples)
+            impossible[measured] &= ~stray_samples(samples[measured])
+        return np.asarray(impossible)
 
     def si(self, values: FloatArray) -> FloatArray:
         """Samples of the channel, (T,), of values as the column has them, (T,)."""
