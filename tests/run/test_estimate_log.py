@@ -9,6 +9,7 @@ from mdf_log import write_mdf
 from scipy.io import loadmat
 
 from conftest import planar_drive
+from vehest.run.estimate_tables import read_estimate_table
 
 asammdf = pytest.importorskip(
     "asammdf", reason="the measurements of these tests are written by asammdf"
@@ -67,6 +68,15 @@ def test_mat_files_contain_log_and_estimate_on_the_same_clock(described):
     stride = round(100.0 * (table["time"][1] - table["time"][0]))
     assert np.array_equal(content["vehest_vy"][::stride][: len(table)], table["vy"], equal_nan=True)
     assert len(content["vehest_band_sideslip"]) == len(content["time"]) == len(drive)
+
+
+def test_mat_files_of_estimates_are_compared_like_tables(described):
+    place, drive = described
+    assert place("estimate", "my drive.mf4", DESCRIBED, "-o", "beta.mat")[0] == 0
+    content = loadmat("beta.mat", squeeze_me=True)
+    estimate = read_estimate_table(Path("beta.mat"), drive)
+    assert np.array_equal(estimate["vy"], content["vehest_vy"], equal_nan=True)
+    assert estimate.time == pytest.approx(content["time"])
 
 
 def test_tables_and_older_measurements_are_not_written_as_mdf_4(described):

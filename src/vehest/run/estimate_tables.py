@@ -34,7 +34,7 @@ CHANNELS_OF_QUANTITIES = {"time": "time", "vy": "vy_ref", "sideslip": "sideslip_
 """Quantity that ``--column`` names -> ``time``, or the channel as which its column is read."""
 SPELLINGS = {
     "time": ("time", "t", "timestamp", "zeit"),
-    "vy_ref": ("vy", "v", "vlat", "lateralvelocity", "vyest", "vyhat"),
+    "vy_ref": ("vy", "v", "vlat", "lateralvelocity", "vyest", "vyhat", "vehestvy"),
     "sideslip_ref": (
         "sideslip",
         "beta",
@@ -44,6 +44,7 @@ SPELLINGS = {
         "sideslipangle",
         "betaest",
         "betahat",
+        "vehestsideslip",
     ),
 }
 """``time``, or channel as which a column is read -> accepted names of the column, without spaces,
