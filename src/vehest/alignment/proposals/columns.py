@@ -268,8 +268,8 @@ def stray_samples(values: FloatArray) -> NDArray[np.bool_]:
 
 
 def _outside(values: FloatArray, distance: float, max_share: float) -> NDArray[np.bool_]:
-    """Samples further from the median than ``distance`` times the spread of all but ``max_share`` at
-    either end, (T,); none where they are more than that share.
+    """Samples further from the median than ``distance`` times the spread of all but ``max_share``
+    at either end, (T,); none where they are more than that share.
     """
     low, middle, high = np.quantile(values, [max_share, 0.5, 1.0 - max_share])
     outside = np.abs(values - middle) > distance * max(high - low, 1e-300)
