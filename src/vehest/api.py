@@ -282,7 +282,7 @@ def read_recording(
     Parameters
     ----------
     log : str, Path or DataFrame
-        A CSV, Parquet or MATLAB file, one of the format that a data set describes, or a DataFrame
+        A CSV, Parquet or MAT-file, one of the format that a data set describes, or a DataFrame
         with its times in a column or as index (seconds, time stamps or time differences).
         ``attrs["units"]`` of a DataFrame may have the units of its columns, ``attrs["name"]`` its
         name.

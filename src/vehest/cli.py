@@ -231,7 +231,7 @@ def new_car(
     Proposes for every column channel, unit, sign and delay, with its evidence, asks where the logs
     do not decide, and writes conf/dataset, conf/split and pipelines/my_car.yaml; where the logs
     have no reference, conf/dataset alone, and the command that estimates without one. Reads tables,
-    Parquet, MATLAB's .mat, MDF, VBO, ROS 2 bags, and logs of a CAN bus with their DBC: `vehest new
+    Parquet, MAT-files, MDF, VBO, ROS 2 bags, and logs of a CAN bus with their DBC: `vehest new
     my_car drive.blf car.dbc`. With --json nothing is asked.
     """
     require_paths(files)

@@ -417,7 +417,7 @@ def test_a_reference_is_made_of_positions_and_yaw_where_there_is_no_other(tmp_pa
 
 
 def test_values_of_wrongly_decoded_frames_do_not_hide_a_channel(tmp_path):
-    """As in the KTH's VBOX logs: 0.6 % of a steering wheel's angle and of a speed are ±27,900."""
+    """0.6 % of the steering wheel's angle and of the speed, at the same times, two in a row."""
     d = drive()
     table = usual(d)
     rows = np.random.default_rng(3).choice(len(d["t"]), round(0.003 * len(d["t"])), replace=False)
@@ -448,7 +448,7 @@ def test_values_of_wrongly_decoded_frames_do_not_hide_a_channel(tmp_path):
             "of 3 (t, v #2, v #3); not read: column 't' as the time: it goes backwards",
         ),
         ("lap.csv", b"t,v\n1,2\n", "1 row of numbers"),
-        ("lap.mat", b"MATLAB 5.0 MAT-file", "cannot be read as MATLAB's"),
+        ("lap.mat", b"MATLAB 5.0 MAT-file", "cannot be read as a MAT-file"),
         ("lap.asc", b"base hex timestamps absolute", "of a CAN bus"),
         (
             "lap.csv",

@@ -1,4 +1,4 @@
-"""MATLAB's files as tables: the ways in which programs save signals, and one clear line for what is
+"""MAT-files as tables: the ways in which programs save signals, and one clear line for what is
 none.
 """
 
@@ -166,9 +166,9 @@ def test_objects_of_matlab_are_named_with_the_way_to_save_their_columns(tmp_path
     [
         (b"MATLAB 7.3 MAT-file".ljust(512) + b"\x89HDF\r\n\x1a\n", "version 7.3, which is HDF5"),
         (b"\x89HDF\r\n\x1a\n" + bytes(600), "version 7.3, which is HDF5"),
-        (b"# Created by Octave 8\n# name: a\n", "cannot be read as MATLAB's"),
-        (b"MATLAB 5.0 MAT-file", "cannot be read as MATLAB's"),
-        (b"", "cannot be read as MATLAB's"),
+        (b"# Created by Octave 8\n# name: a\n", "cannot be read as a MAT-file"),
+        (b"MATLAB 5.0 MAT-file", "cannot be read as a MAT-file"),
+        (b"", "cannot be read as a MAT-file"),
     ],
 )
 def test_other_files_of_that_name_are_refused_with_the_way_to_save_them(tmp_path, content, says):

@@ -126,7 +126,7 @@ def read_estimate_table(
     Parameters
     ----------
     file : Path
-        CSV, Parquet or MATLAB's. An estimate of ``vehest estimate`` in Parquet is read as it is.
+        CSV, Parquet or MAT-file. An estimate of ``vehest estimate`` in Parquet is read as it is.
     drive : Recording
         That was estimated.
     columns : sequence of NamedColumn

@@ -1,4 +1,4 @@
-"""MATLAB's files (.mat) as tables: which columns of numbers one has, and their samples.
+"""MAT-files of MATLAB as tables: which columns of numbers one has, and their samples.
 
 They are read in a limited process (`vehest.sources.readers.mat`).
 """
@@ -35,7 +35,7 @@ class MatContents:
 
 
 def is_matlab(file: Path) -> bool:
-    """Whether a file is MATLAB's by its ending."""
+    """Whether a file is a MAT-file by its ending."""
     return file.suffix.lower() == ".mat"
 
 

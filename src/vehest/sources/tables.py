@@ -1,4 +1,4 @@
-"""Reads columns of numbers from tables: of text (CSV), Parquet and MATLAB's files.
+"""Reads columns of numbers from tables: text (CSV), Parquet and MAT-files.
 
 file -> names of its columns -> pyarrow or scipy -> columns of float64
 """
@@ -69,7 +69,7 @@ def is_parquet(file: Path) -> bool:
 
 
 def is_text(file: Path) -> bool:
-    """Whether a table is text, perhaps packed: neither Parquet nor MATLAB's."""
+    """Whether a table is text, perhaps packed: neither Parquet nor a MAT-file."""
     return not (is_parquet(file) or is_matlab(file))
 
 
@@ -221,7 +221,7 @@ def read_columns(
     Parameters
     ----------
     file : Path
-        Table of text, perhaps packed, Parquet or MATLAB's.
+        Table of text, perhaps packed, Parquet or MAT-file.
     selected : sequence of str
         Names of the wanted columns; others are not converted.
     layout : TextLayout

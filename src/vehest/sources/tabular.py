@@ -1,4 +1,4 @@
-"""Source of tables (CSV, Parquet, MATLAB's files) with a column a channel.
+"""Source of tables (CSV, Parquet, MAT-files) with a column a channel.
 
 Names, units and signs are declared in conf/dataset.
 """

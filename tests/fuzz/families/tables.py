@@ -79,7 +79,7 @@ def parquet(case):
 
 @generator(weight=4)
 def matlab(case):
-    """Bytes of a file of MATLAB's, and zeros that pack to next to nothing."""
+    """Bytes of a MAT-file, and zeros that pack to next to nothing."""
     file = case.place / "lap.mat"
     if case.idea(4) == 0:
         zeros = np.zeros(case.rng.choice([10**6, 10**7]))

@@ -82,8 +82,8 @@ class Proposal:
         channel = CHANNELS[self.channel]
         samples = self.si(values)
         impossible = (samples < channel.low) | (samples > channel.high)
-        if impossible.any():
-            measured = np.isfinite(samples)
+        measured = np.isfinite(samples)
+        if impossible[measured].any():
             impossible[measured] &= ~stray_samples(samples[measured])
         return np.asarray(impossible)
 

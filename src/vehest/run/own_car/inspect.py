@@ -50,7 +50,7 @@ MAX_COMPARED_ROWS = 4_000
 USUAL_STEP_QUANTILE = 0.99  # quantile of a velocity's |steps|, above which rows are not compared
 # |correlation| with these steps, above which a column is their difference
 MIN_DIFFERENCE_CORRELATION = 0.999
-TABLES = ("tabular", "text_log")  # sources of tables: text, Parquet and MATLAB's
+TABLES = ("tabular", "text_log")  # sources of tables: text, Parquet and MAT-files
 DBC = ".dbc"  # suffix of a description of a CAN bus
 LAYOUT = {
     "delimiter": ",",

@@ -1,4 +1,4 @@
-"""Columns of numbers in MATLAB's files (MAT 4, 5 and 7) by scipy, which evaluates nothing in them.
+"""Columns of numbers in MAT-files (versions 4, 5 and 7) by scipy, which evaluates nothing in them.
 
 file -> variables -> fields of structures -> vectors, and matrices by column -> numbers by name
 """
@@ -21,7 +21,7 @@ from vehest.data.errors import DataError, printable
 from vehest.data.limits import check_limit
 from vehest.sources.limited import Arrays
 
-# first bytes of an HDF5 file, in version 7.3 behind a header of MATLAB's
+# first bytes of an HDF5 file, in a MAT-file of version 7.3 behind a header
 HDF5 = b"\x89HDF\r\n\x1a\n"
 HEADER = 512  # length of that header [bytes]
 # fields that hold the samples of a signal, in small letters; they are left out of its name
@@ -45,7 +45,7 @@ def read(file: Path, selected: Sequence[str] | None) -> tuple[Arrays, dict[str, 
     Parameters
     ----------
     file : Path
-        MAT 4, 5 or 7; 7.3 is HDF5 and is refused.
+        MAT-file of version 4, 5 or 7; 7.3 is HDF5 and is refused.
     selected : sequence of str or None
         Columns whose samples are returned; None for none of them.
 
@@ -67,8 +67,7 @@ def read(file: Path, selected: Sequence[str] | None) -> tuple[Arrays, dict[str, 
     units: dict[FieldPath, str] = {}
     for name, value in _variables(file).items():
         for path, vector, unit in _vectors((name,), value, skipped):
-            is_new = path not in vectors
-            path = path if is_new else (*path, str(len(vectors)))
+            path = path if path not in vectors else (*path, str(len(vectors)))
             vectors[path] = vector
             units[path] = unit
     vectors = _without_repeated_times(vectors)
@@ -94,8 +93,8 @@ def _variables(file: Path) -> dict[str, Any]:
         head = stream.read(HEADER + len(HDF5))
     if HDF5 in (head[: len(HDF5)], head[HEADER:]):
         raise DataError(
-            f"'{file}' is of MATLAB's version 7.3, which is HDF5; save it as version 7, in MATLAB "
-            f"by S = load('{file.name}'); save('{file.stem}_v7.mat', '-struct', 'S', '-v7')"
+            f"'{file}' is a MAT-file of version 7.3, which is HDF5; save it as version 7, in "
+            f"MATLAB by S = load('{file.name}'); save('{file.stem}_v7.mat', '-struct', 'S', '-v7')"
         )
     try:
         return {
@@ -106,8 +105,8 @@ def _variables(file: Path) -> dict[str, Any]:
     except Exception as error:
         reason = printable(" ".join(str(error).split())[:160]) or type(error).__name__
         raise DataError(
-            f"'{file}' cannot be read as MATLAB's ({reason}); is it damaged, or of another format? "
-            f"MATLAB and Octave save by save('-v7', '{file.name}')"
+            f"'{file}' cannot be read as a MAT-file ({reason}); is it damaged, or of another "
+            f"format? MATLAB and Octave save by save('-v7', '{file.name}')"
         ) from None
 
 
@@ -116,9 +115,11 @@ def _vectors(
 ) -> Iterator[tuple[FieldPath, NDArray[Any], str]]:
     """Path, samples and unit of each column in a value; ``skipped`` gets what holds none."""
     name = printable(_joined(path))
-    if isinstance(value, MatlabOpaque | MatlabFunction):
+    if isinstance(value, MatlabFunction):
+        skipped.append(f"variable '{name}', a function")
+    elif isinstance(value, MatlabOpaque):
         skipped.append(
-            f"{_object_of(name, value)}; save its columns as vectors, those of a table or "
+            f"{_object_in(value)}; save its columns as vectors, those of a table or "
             "timetable T in MATLAB by S = table2struct(timetable2table(T), 'ToScalar', true); "
             "save('lap.mat', '-struct', 'S')"
         )
@@ -127,8 +128,9 @@ def _vectors(
             skipped.append(f"variable '{name}', which is no vector of real numbers")
     elif value.dtype.names:
         if len(path) > MAX_DEPTH:
-            raise DataError(f"'{name}' is in more than {MAX_DEPTH} structures within one another")
-        yield from _vectors_of_structure(path, value.ravel(), skipped)
+            skipped.append(f"'{name}', in more than {MAX_DEPTH} structures within one another")
+        else:
+            yield from _vectors_of_structure(path, value.ravel(), skipped)
     elif value.dtype.kind == "O":
         if value.size:
             skipped.append(f"variable '{name}', a cell array")
@@ -175,10 +177,8 @@ def _text(value: Any) -> str:
     return str(value.item()).strip() if is_text else ""
 
 
-def _object_of(name: str, value: Any) -> str:
+def _object_in(value: MatlabOpaque) -> str:
     """Clause on an object that only MATLAB reads, whose name and class are among its fields."""
-    if isinstance(value, MatlabFunction):
-        return f"variable '{name}' is a function"
     own_name, _, kind, _ = value.ravel()[0].tolist()
     return f"variable '{printable(own_name.decode())}' is a {printable(kind.decode())}"
 

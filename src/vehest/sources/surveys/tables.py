@@ -1,4 +1,4 @@
-"""Tables of text, Parquet and MATLAB's: delimiter, decimal mark, encoding, lines before the names,
+"""Tables of text, Parquet and MAT-files: delimiter, decimal mark, encoding, lines before the names,
 a row of units below them.
 
 file -> its first lines -> the `Shape` that explains most of them -> pyarrow -> columns of numbers
@@ -163,7 +163,7 @@ class Shape:
 
 
 def survey_table(file: Path) -> Log:
-    """Columns, clock and layout of a table of text, of Parquet or of MATLAB's.
+    """Columns, clock and layout of a table of text, Parquet or a MAT-file.
 
     The source is ``text_log`` where ``tabular`` cannot read it: with rows below the names, marks of
     missing samples, or clock times.
@@ -311,8 +311,8 @@ def _unread_column(field: pa.Field) -> str:
 
 
 def _of_other_lengths(contents: MatContents) -> list[str]:
-    """Texts on what is not read of MATLAB's files: among it columns of another number of samples
-    than most have.
+    """Texts on what is not read of a MAT-file, columns that have another number of samples than
+    most among it.
     """
     others: dict[int, list[str]] = {}
     for name, size in contents.lengths.items():
